@@ -1,0 +1,1 @@
+"""Command line, launcher, robots, scenarios, replay and reports."""

@@ -1,0 +1,1 @@
+"""The simulated robot: MuJoCo, drive firmware, CiA 402 devices, sensors."""

@@ -1,0 +1,73 @@
+"""The controller's configuration: gains, solver and the phases of a run."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from schemas.base import ControlMode, Model
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+class TaskGains(Model):
+    """Gains of a motion task, (6)-(8) of [Benallegue 2021]: ẍ = K_p (x^d − x) + K_v (ẋ^d − ẋ) + ẍ^d."""
+
+    stiffness: NonNegative
+    """K_p [1/s²]."""
+    damping: NonNegative
+    """K_v [1/s]."""
+    weight: NonNegative
+
+
+class HandPath(Model):
+    """A closed path of the hand at fixed orientation, started and left at rest (minimum-jerk along the path)."""
+
+    shape: Literal["circle", "square"] = "circle"
+    plane: Literal["xy", "yz", "xz"] = "yz"
+    diameter_m: PositiveFloat
+    lap_s: PositiveFloat
+    laps: PositiveInt = 1
+
+
+class Phase(Model):
+    """A stretch of a run: the mode of the drives and what the tasks follow. What is absent is held."""
+
+    name: str
+    mode: ControlMode
+    duration_s: PositiveFloat
+    posture: dict[str, float] = {}
+    """Joint angles [rad] to reach by a minimum-jerk motion within the phase; joints not named stay."""
+    hand_path: HandPath | None = None
+
+
+class QpConfig(Model):
+    """The quadratic program (5)."""
+
+    solver: Literal["osqp", "daqp"] = "osqp"
+    iterations: PositiveInt = 200
+    """Upper bound on the solver's iterations a tick."""
+    tolerance: PositiveFloat = 1e-6
+    regularization: PositiveFloat = 1e-6
+    """γ of (5)."""
+    damper_s: PositiveFloat = 0.05
+    """Time constant of the range limit's velocity damper: q̇ ≤ (q_max − q) / damper_s near the limit."""
+
+
+class ControllerConfig(Model):
+    """Gains of the law and the tasks, and the phases. λ times the period must not exceed 0.3 (see `lambda_`)."""
+
+    lambda_: Annotated[float, Field(alias="lambda", gt=0.0)] = 2.0
+    """λ of K = λ diag(M) [1/s]. The integral loop's discrete pole sits near 1 − λT and a cycle of delay costs phase:
+    λT ≤ 0.3 is required, well below is advised."""
+    integral: Literal["passivity", "none"] = "passivity"
+    """`passivity`: L s = (C + K) s of (3), (4); `none`: u = uʳ alone, the baseline without integral term."""
+    initialize_integral: bool = True
+    """Position→torque transition: start the integral term at the torque difference (section IV-A); False is naive."""
+    velocity_cutoff_hz: PositiveFloat = 60.0
+    """First-order low-pass on the differentiated positions."""
+    posture: TaskGains = TaskGains(stiffness=25.0, damping=10.0, weight=1.0)
+    hand: TaskGains = TaskGains(stiffness=400.0, damping=40.0, weight=1000.0)
+    qp: QpConfig = QpConfig()
+    phases: Annotated[tuple[Phase, ...], Field(min_length=1)]

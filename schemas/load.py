@@ -1,0 +1,234 @@
+"""Read robots and scenarios from YAML; every fault is one message with file, field and what was expected."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from schemas.bus_load import bus_loads
+from schemas.errors import ConfigurationError
+from schemas.robot import RobotDescription
+from schemas.scenario import Scenario
+
+M = TypeVar("M", bound=BaseModel)
+
+MAXIMUM_LAMBDA_PERIOD = 0.3
+"""λT above this leaves no phase margin for the integral loop with a cycle of delay."""
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A checked description with the text of its URDF: all that the services need, with no path left to resolve."""
+
+    description: RobotDescription
+    urdf: str
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A robot and a scenario that fit each other: what every process of a run is given."""
+
+    robot: Robot
+    scenario: Scenario
+
+    @property
+    def cycles(self) -> int:
+        """Number of states of the run."""
+        return round(self.scenario.duration_s * self.robot.description.rate_hz)
+
+
+def load_run(scenario: str, overrides: dict[str, Any] | None = None) -> Run:
+    """Read a scenario (a packaged name or a path) and its robot.
+
+    `overrides` maps dotted paths to values, e.g. `{"plant.torque_scale": 0.8, "robot.rate_hz": 250}`: paths that start
+    with `robot.` reach the robot description, others the scenario.
+
+    Raises:
+        ConfigurationError: with file, field and reason.
+
+    """
+    path = _find(scenario, "scenarios", "scenario")
+    split = {True: {}, False: {}}  # type: dict[bool, dict[str, Any]]
+    for key, value in (overrides or {}).items():
+        of_robot = key.startswith("robot.")
+        split[of_robot][key.removeprefix("robot.")] = value
+    config = _parse(Scenario, _override(_read_yaml(path), split[False], path), path)
+    beside = path.parent / config.robot
+    robot = load_robot(str(beside) if beside.is_file() else config.robot, split[True])
+    check_run(robot.description, config, path)
+    return Run(robot, config)
+
+
+def load_robot(robot: str, overrides: dict[str, Any] | None = None, *, allow_overload: bool = False) -> Robot:
+    """Read and check a robot description (a packaged name or a path) and its URDF.
+
+    Raises:
+        ConfigurationError: unknown field, NaN, duplicate node id, joint missing in the URDF, bus over 100 %, …
+
+    """
+    path = _find(robot, "robots", "robot")
+    description = _parse(RobotDescription, _override(_read_yaml(path), overrides or {}, path), path)
+    urdf_path = resolve_urdf(description.urdf, path)
+    urdf = urdf_path.read_text(encoding="utf-8")
+    _check_urdf(description, urdf, path, urdf_path)
+    for load in bus_loads(description):
+        if load.fraction > 1.0 and not allow_overload:
+            raise ConfigurationError(
+                f"{path}: bus {load.bus} is overloaded: {load.explain()}."
+                " Lower rate_hz, move joints to another bus, or add a bus."
+            )
+    return Robot(description, urdf)
+
+
+def resolve_urdf(urdf: str, robot_file: Path) -> Path:
+    """Path of a description's URDF; `package://` names an installed Python package.
+
+    Raises:
+        ConfigurationError: the package or the file does not exist.
+
+    """
+    if urdf.startswith("package://"):
+        package, _, inner = urdf.removeprefix("package://").partition("/")
+        spec = importlib.util.find_spec(package)
+        if spec is None or not spec.submodule_search_locations:
+            raise ConfigurationError(f"{robot_file}: urdf: Python package {package!r} is not installed")
+        path = Path(next(iter(spec.submodule_search_locations))) / inner
+    else:
+        path = robot_file.parent / urdf
+    if not path.is_file():
+        raise ConfigurationError(f"{robot_file}: urdf: no file at {path}")
+    return path
+
+
+def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> None:
+    """Refuse a scenario that does not fit its robot.
+
+    Raises:
+        ConfigurationError: unknown joint, substep that does not divide the period, λT above 0.3, …
+
+    """
+    names = set(robot.joint_names)
+    mentions = [("plant.initial_posture", joint) for joint in scenario.plant.initial_posture]
+    mentions += [
+        (f"controller.phases.{index}.posture", joint)
+        for index, phase in enumerate(scenario.controller.phases)
+        for joint in phase.posture
+    ]
+    for field, joint in mentions:
+        if joint not in names:
+            raise ConfigurationError(
+                f"{path}: {field}: robot {robot.name} has no joint {joint!r}; it has {', '.join(robot.joint_names)}"
+            )
+    ratio = robot.period_s / scenario.plant.substep_s
+    if not math.isclose(ratio, round(ratio), rel_tol=1e-9) or ratio < 1.0:
+        raise ConfigurationError(
+            f"{path}: plant.substep_s: {scenario.plant.substep_s:g} s does not divide the period {robot.period_s:g} s"
+        )
+    product = scenario.controller.lambda_ * robot.period_s
+    if product > MAXIMUM_LAMBDA_PERIOD:
+        raise ConfigurationError(
+            f"{path}: controller.lambda: λT = {product:.3g} with T = {robot.period_s:g} s; expected at most"
+            f" {MAXIMUM_LAMBDA_PERIOD} (λ ≤ {MAXIMUM_LAMBDA_PERIOD * robot.rate_hz:g}), or the integral loop is unstable"
+        )
+    for index, phase in enumerate(scenario.controller.phases):
+        if phase.hand_path is not None and robot.hand_frame is None:
+            raise ConfigurationError(
+                f"{path}: controller.phases.{index}.hand_path: robot {robot.name} has no hand_frame"
+            )
+
+
+def _find(name: str, folder: str, what: str) -> Path:
+    path = Path(name)
+    if path.suffix in {".yaml", ".yml"}:
+        if path.is_file():
+            return path
+        raise ConfigurationError(f"no {what} file at {path}")
+    packaged = Path(str(resources.files("deploy"))) / folder
+    candidates = (packaged / f"{name}.yaml", packaged / name / f"{name}.yaml")
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    known = sorted(file.stem for file in packaged.rglob("*.yaml"))
+    raise ConfigurationError(f"no {what} {name!r}: give a .yaml file or one of {', '.join(known)}")
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ConfigurationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict):
+        raise ConfigurationError(f"{path}: expected a mapping of fields at the top")
+    return data
+
+
+def _override(data: dict[str, Any], overrides: dict[str, Any], path: Path) -> dict[str, Any]:
+    for dotted, value in overrides.items():
+        node: Any = data
+        *parents, leaf = dotted.split(".")
+        for part in parents:
+            if isinstance(node, list):
+                node = node[_list_index(part, node, dotted, path)]
+            elif isinstance(node, dict):
+                node = node.setdefault(part, {})
+            else:
+                raise ConfigurationError(f"{path}: --set {dotted}: {part!r} lies below a plain value")
+        if isinstance(node, list):
+            node[_list_index(leaf, node, dotted, path)] = value
+        elif isinstance(node, dict):
+            node[leaf] = value
+        else:
+            raise ConfigurationError(f"{path}: --set {dotted}: {leaf!r} lies below a plain value")
+    return data
+
+
+def _list_index(part: str, node: list[Any], dotted: str, path: Path) -> int:
+    if part.isdigit() and int(part) < len(node):
+        return int(part)
+    for index, item in enumerate(node):
+        if isinstance(item, dict) and item.get("name") == part:
+            return index
+    raise ConfigurationError(f"{path}: --set {dotted}: no item {part!r} in a list of {len(node)}")
+
+
+def _parse(model: type[M], data: dict[str, Any], path: Path) -> M:
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        faults = [
+            f"{'.'.join(str(part) for part in fault['loc']) or model.__name__}: {fault['msg'].removeprefix('Value error, ')}"
+            for fault in error.errors()
+        ]
+        more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
+        raise ConfigurationError(f"{path}: {'; '.join(faults[:3])}{more}") from error
+
+
+def _check_urdf(robot: RobotDescription, urdf: str, path: Path, urdf_path: Path) -> None:
+    try:
+        root = ElementTree.fromstring(urdf)
+    except ElementTree.ParseError as error:
+        raise ConfigurationError(f"{urdf_path}: not valid XML: {error}") from error
+    joints = {joint.get("name"): joint for joint in root.iter("joint") if joint.get("type") is not None}
+    links = {link.get("name") for link in root.findall("link")}
+    for index, joint in enumerate(robot.joints):
+        element = joints.get(joint.name)
+        if element is None:
+            raise ConfigurationError(f"{path}: joints.{index}.name: {urdf_path.name} has no joint {joint.name!r}")
+        if element.get("type") not in {"revolute", "continuous", "prismatic"}:
+            raise ConfigurationError(
+                f"{path}: joints.{index}: {joint.name} is {element.get('type')} in {urdf_path.name}, expected revolute"
+            )
+    frames = [("hand_frame", robot.hand_frame)] if robot.hand_frame else []
+    frames += [(f"force_torque_sensors.{i}.frame", s.frame) for i, s in enumerate(robot.force_torque_sensors)]
+    frames += [(f"imus.{i}.frame", s.frame) for i, s in enumerate(robot.imus)]
+    for field, frame in frames:
+        if frame not in links:
+            raise ConfigurationError(f"{path}: {field}: {urdf_path.name} has no link {frame!r}")

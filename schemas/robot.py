@@ -1,0 +1,197 @@
+"""The robot description: joints, drives, buses, sensors and safety limits, read from one YAML file beside a URDF."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+
+from schemas.base import Model, Vector3
+
+NodeId = Annotated[int, Field(ge=1, le=127)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+class Bus(Model):
+    """One CAN bus, opened by python-can as `can.Bus(interface=…, channel=…, bitrate=…)`."""
+
+    name: str
+    interface: str = "cosim"
+    channel: str
+    """For `cosim` a socket path; a bare name lies in the run directory. For `socketcan` the interface's name."""
+    bitrate: PositiveInt = 1_000_000
+
+
+class Drive(Model):
+    """A CiA 402 drive of one of the three HRP-style kinds, and its firmware as the maker states it.
+
+    Firmware in the position modes: τ = D(k_p (q_t − q) + k_d (q̇_t − q̇)), clipped to the torque limit, where D is the
+    current's dead zone D(x) = sign(x) max(|x| − d, 0); in torque mode τ = D(τ_t). All at the joint, in N·m and rad.
+    """
+
+    kind: Literal["position_pd", "torque", "servo"]
+    bus: str
+    node_id: NodeId
+    rated_motor_torque: PositiveFloat
+    """Of the motor, before the gear [N·m]; object 0x6076 holds it in mN·m and torques on the bus are ‰ of it."""
+    position_gain: PositiveFloat
+    """k_p [N·m/rad] at the joint."""
+    velocity_gain: NonNegative
+    """k_d [N·m·s/rad] at the joint."""
+    dead_zone: NonNegative = 0.0
+    """d [N·m] at the joint, as known to the HAL, which commands its inverse; the plant's may differ."""
+    vendor_id: int = 0x00000402
+    product_code: int = 0x00000001
+
+
+class Joint(Model):
+    """One actuated joint: its URDF joint's name, the gear and motor, limits, encoder and drive."""
+
+    name: str
+    gear_ratio: PositiveFloat
+    rotor_inertia: NonNegative
+    """[kg·m²] at the motor; the joint feels it times the square of the gear ratio."""
+    torque_limit: PositiveFloat
+    """[N·m] at the joint; enforced by the HAL and the drive."""
+    torque_rate_limit: PositiveFloat
+    """[N·m/s] at the joint; enforced by the HAL."""
+    velocity_limit: PositiveFloat
+    """[rad/s]; enforced by the HAL on commanded positions, a constraint for the controller."""
+    position_min: float
+    position_max: float
+    encoder_counts: PositiveInt
+    """Counts per turn of the motor."""
+    direction: Literal[-1, 1] = 1
+    """Sign of the drive's counts and torques against the URDF's axis."""
+    zero_offset: float = 0.0
+    """Joint angle [rad] at zero counts."""
+    drive: Drive
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.position_min < self.position_max:
+            raise ValueError(f"position_min {self.position_min} must lie below position_max {self.position_max}")
+        counts = max(abs(self.position_min - self.zero_offset), abs(self.position_max - self.zero_offset))
+        counts *= self.gear_ratio * self.encoder_counts / 6.283185307179586
+        if counts >= 2**31:
+            raise ValueError(f"the position range needs {counts:.3g} encoder counts, more than the bus's 32 bits hold")
+        per_mille = 1000.0 * self.torque_limit / (self.drive.rated_motor_torque * self.gear_ratio)
+        if per_mille > 32767:
+            raise ValueError(f"torque_limit is {per_mille:.0f} ‰ of the rated torque, more than the bus's 16 bits hold")
+        return self
+
+
+class ForceTorqueSensor(Model):
+    """A six-axis sensor with the Robotous RFT frame layout: two 8-byte frames a cycle, at `can_id` and `can_id + 1`."""
+
+    name: str
+    frame: str
+    """URDF link whose frame is the sensor's; it measures the wrench that the parent side exerts on what lies beyond."""
+    bus: str
+    can_id: Annotated[int, Field(ge=1, le=0x7FE)]
+    command_id: Annotated[int, Field(ge=1, le=0x7FF)]
+    """Identifier the sensor listens on for start and stop."""
+    force_resolution: PositiveFloat = 1.0 / 50.0
+    """[N] a count."""
+    torque_resolution: PositiveFloat = 1.0 / 2000.0
+    """[N·m] a count."""
+
+
+class Imu(Model):
+    """An inertial unit with the Xsens MTi-600 frame layout: gyro, acceleration and quaternion frames a cycle."""
+
+    name: str
+    frame: str
+    bus: str
+    base_id: Annotated[int, Field(ge=0, le=0x7C0)]
+    """Added to the maker's identifiers 0x32 (gyro), 0x34 (acceleration), 0x21 (quaternion), which outrank SYNC."""
+
+
+class Safety(Model):
+    """What the HAL does by itself, whatever the controller says."""
+
+    missed_commands: PositiveInt = 5
+    """Cycles in a row without a valid command after which the HAL stops (realtime clock)."""
+    command_timeout_s: PositiveFloat = 0.4
+    """Wall-clock wait for a command in lockstep before the safe stop."""
+    sync_timeout_cycles: PositiveInt = 5
+    """Cycles without SYNC or RPDO after which a drive holds by its own means."""
+    hold_ramp_s: PositiveFloat = 0.2
+    """Time over which a held torque offset goes over into the position loop."""
+    heartbeat_s: PositiveFloat = 0.1
+    """Producer heartbeat of every node and of the HAL; three missing are a loss."""
+
+
+class RobotDescription(Model):
+    """Everything the HAL, the controller's model and the simulated plant need to know of a robot.
+
+    The arrays of all messages follow the order of `joints`. Controller and plant read the same description; what
+    differs in truth (masses, friction, torque scale) is perturbed in the plant by the scenario.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
+    urdf: str
+    """Path relative to this file, absolute path, or `package://<Python package>/<path>`."""
+    rate_hz: PositiveFloat
+    command_delay_cycles: Literal[1, 2] = 1
+    """The SYNC after the measured one at which a command takes effect."""
+    compute_budget_s: PositiveFloat
+    """Time from the last TPDO to the first RPDO that the cycle leaves for Zenoh and the controller."""
+    hand_frame: str | None = None
+    """URDF link that Cartesian tasks move."""
+    buses: Annotated[tuple[Bus, ...], Field(min_length=1)]
+    joints: Annotated[tuple[Joint, ...], Field(min_length=1)]
+    force_torque_sensors: tuple[ForceTorqueSensor, ...] = ()
+    imus: tuple[Imu, ...] = ()
+    gravity_in_world: Vector3 = (0.0, 0.0, -9.81)
+    safety: Safety = Safety()
+
+    @property
+    def period_s(self) -> float:
+        """Length of a cycle [s]."""
+        return 1.0 / self.rate_hz
+
+    @property
+    def period_ns(self) -> int:
+        """Length of a cycle [ns], rounded once here: message k has time k times this."""
+        return round(1e9 / self.rate_hz)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names in the order of all arrays."""
+        return tuple(joint.name for joint in self.joints)
+
+    def bus_index(self, name: str) -> int:
+        """Index of a bus in `buses`."""
+        return next(index for index, bus in enumerate(self.buses) if bus.name == name)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _refuse_twice("bus", [bus.name for bus in self.buses])
+        _refuse_twice("bus channel", [f"{bus.interface}:{bus.channel}" for bus in self.buses])
+        _refuse_twice("joint", [joint.name for joint in self.joints])
+        _refuse_twice("sensor", [sensor.name for sensor in (*self.force_torque_sensors, *self.imus)])
+        names = {bus.name for bus in self.buses}
+        users = [(joint.name, joint.drive.bus) for joint in self.joints]
+        users += [(sensor.name, sensor.bus) for sensor in (*self.force_torque_sensors, *self.imus)]
+        for user, bus in users:
+            if bus not in names:
+                raise ValueError(f"{user}: unknown bus {bus!r}; the buses are {', '.join(sorted(names))}")
+        for bus in self.buses:
+            owners: dict[int, str] = {}
+            for joint in self.joints:
+                if joint.drive.bus == bus.name:
+                    _claim(owners, joint.drive.node_id, joint.name, f"node id on bus {bus.name}")
+        return self
+
+
+def _refuse_twice(what: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{what} {name!r} is given twice")
+
+
+def _claim(owners: dict[int, str], number: int, user: str, what: str) -> None:
+    if number in owners:
+        raise ValueError(f"{what}: {number} is used by {owners[number]} and by {user}")
+    owners[number] = user

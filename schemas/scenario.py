@@ -1,0 +1,77 @@
+"""The scenario: which robot, which clock, how the plant differs from the model, what the controller does."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, PositiveFloat
+
+from schemas.base import Clock, Model
+from schemas.controller import ControllerConfig
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+class Friction(Model):
+    """Friction at the motor side, [Cisneros 2018] Table I; reflected to the joint through the gear N.
+
+    τ_f(q̇) = N (c + (b − c) exp(−(q̇ N / v_s)²)) sign(q̇) + N² v q̇; at rest any torque up to N b is resisted.
+    """
+
+    coulomb: NonNegative = 0.04
+    """c [N·m]."""
+    breakaway: NonNegative = 0.05
+    """b [N·m]."""
+    viscous: NonNegative = 0.0005
+    """v [N·m·s/rad]."""
+    stribeck_velocity: PositiveFloat = 0.2
+    """v_s [rad/s] of the motor."""
+
+
+class SensorNoise(Model):
+    """Standard deviations of white noise, and of biases drawn once a run; zero is a clean signal."""
+
+    force: NonNegative = 0.0
+    torque: NonNegative = 0.0
+    force_bias: NonNegative = 0.0
+    torque_bias: NonNegative = 0.0
+    angular_velocity: NonNegative = 0.0
+    acceleration: NonNegative = 0.0
+    motor_torque: NonNegative = 0.0
+    """[N·m] at the joint, on the reported motor torque."""
+
+
+class PlantConfig(Model):
+    """How the simulated robot differs from its description, and how finely it is simulated."""
+
+    substep_s: PositiveFloat = 0.0005
+    """MuJoCo and firmware step; must divide the period."""
+    torque_scale: PositiveFloat = 0.9
+    """True motor torque over the nominal one."""
+    mass_error: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    """Every link's mass (and inertia) is multiplied by 1 ± this, the sign drawn from the seed."""
+    dead_zone_scale: NonNegative = 1.0
+    """True dead zone over the described one."""
+    friction: Friction = Friction()
+    noise: SensorNoise = SensorNoise()
+    free_run_after_s: PositiveFloat = 0.15
+    """Lockstep: wall-clock silence of the bus after which the plant runs on by itself so that drives notice."""
+    initial_posture: dict[str, float] = {}
+    """Joint angles [rad] at the start; joints not named start at 0 or the nearest limit."""
+    truth_frames: tuple[str, ...] = ()
+    """Extra URDF frames whose true poses are reported; the hand frame always is."""
+
+
+class Scenario(Model):
+    """One run, whole: with the robot description it determines every message of a lockstep run."""
+
+    name: str
+    description: str = ""
+    robot: str
+    """Name of a robot that comes with the package, or path of a robot file, relative to this file."""
+    clock: Clock = Clock.LOCKSTEP
+    duration_s: PositiveFloat
+    seed: Annotated[int, Field(ge=0)] = 0
+    namespace: str = "cosim"
+    plant: PlantConfig = PlantConfig()
+    controller: ControllerConfig
