@@ -61,7 +61,7 @@ class BusLoad:
         return _bits(self.commands) / self.bitrate
 
     def explain(self) -> str:
-        """The arithmetic in one line."""
+        """Show the arithmetic in one line."""
         counts = Counter((("SYNC", SYNC_BYTES), *self.reports, *self.commands))
         terms = " + ".join(f"{n}×{name}({worst_case_bits(size)} bit)" for (name, size), n in counts.items())
         return (

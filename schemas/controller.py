@@ -37,7 +37,7 @@ class Phase(Model):
     name: str
     mode: ControlMode
     duration_s: PositiveFloat
-    posture: dict[str, float] = {}
+    posture: dict[str, float] = Field(default_factory=dict)
     """Joint angles [rad] to reach by a minimum-jerk motion within the phase; joints not named stay."""
     hand_path: HandPath | None = None
 

@@ -136,7 +136,8 @@ def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> 
     if product > MAXIMUM_LAMBDA_PERIOD:
         raise ConfigurationError(
             f"{path}: controller.lambda: λT = {product:.3g} with T = {robot.period_s:g} s; expected at most"
-            f" {MAXIMUM_LAMBDA_PERIOD} (λ ≤ {MAXIMUM_LAMBDA_PERIOD * robot.rate_hz:g}), or the integral loop is unstable"
+            f" {MAXIMUM_LAMBDA_PERIOD} (λ ≤ {MAXIMUM_LAMBDA_PERIOD * robot.rate_hz:g}), or the integral loop"
+            " is unstable"
         )
     for index, phase in enumerate(scenario.controller.phases):
         if phase.hand_path is not None and robot.hand_frame is None:
@@ -203,10 +204,10 @@ def _parse(model: type[M], data: dict[str, Any], path: Path) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        faults = [
-            f"{'.'.join(str(part) for part in fault['loc']) or model.__name__}: {fault['msg'].removeprefix('Value error, ')}"
-            for fault in error.errors()
-        ]
+        faults = []
+        for fault in error.errors():
+            field = ".".join(str(part) for part in fault["loc"]) or model.__name__
+            faults.append(f"{field}: {fault['msg'].removeprefix('Value error, ')}")
         more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
         raise ConfigurationError(f"{path}: {'; '.join(faults[:3])}{more}") from error
 

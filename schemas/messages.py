@@ -11,7 +11,7 @@ from __future__ import annotations
 from enum import IntEnum, StrEnum
 from typing import Literal
 
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from schemas.base import ControlMode, Model, Quaternion, Vector, Vector3
 
@@ -170,7 +170,7 @@ class PlantTruth(Model):
     """Torque of joint friction, opposing motion [N·m]."""
     frames: dict[str, PoseSample]
     """True poses of the frames named in the scenario."""
-    sensor_wrenches: dict[str, tuple[Vector3, Vector3]] = {}
+    sensor_wrenches: dict[str, tuple[Vector3, Vector3]] = Field(default_factory=dict)
     """Force and moment each F/T sensor would read without noise, offset and quantisation, in the sensor frame."""
     contact_force: float = 0.0
     """Sum of the norms of all contact forces [N]."""

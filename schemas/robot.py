@@ -112,8 +112,8 @@ class Safety(Model):
 
     missed_commands: PositiveInt = 5
     """Cycles in a row without a valid command after which the HAL stops (realtime clock)."""
-    command_timeout_s: PositiveFloat = 0.4
-    """Wall-clock wait for a command in lockstep before the safe stop."""
+    command_timeout_s: PositiveFloat = 1.0
+    """Wall-clock wait in lockstep for a controller that hangs, before the safe stop; one that died shows sooner."""
     sync_timeout_cycles: PositiveInt = 5
     """Cycles without SYNC or RPDO after which a drive holds by its own means."""
     hold_ramp_s: PositiveFloat = 0.2
@@ -170,13 +170,14 @@ class RobotDescription(Model):
         _refuse_twice("bus", [bus.name for bus in self.buses])
         _refuse_twice("bus channel", [f"{bus.interface}:{bus.channel}" for bus in self.buses])
         _refuse_twice("joint", [joint.name for joint in self.joints])
-        _refuse_twice("sensor", [sensor.name for sensor in (*self.force_torque_sensors, *self.imus)])
+        sensors: tuple[ForceTorqueSensor | Imu, ...] = (*self.force_torque_sensors, *self.imus)
+        _refuse_twice("sensor", [sensor.name for sensor in sensors])
         names = {bus.name for bus in self.buses}
         users = [(joint.name, joint.drive.bus) for joint in self.joints]
-        users += [(sensor.name, sensor.bus) for sensor in (*self.force_torque_sensors, *self.imus)]
-        for user, bus in users:
-            if bus not in names:
-                raise ValueError(f"{user}: unknown bus {bus!r}; the buses are {', '.join(sorted(names))}")
+        users += [(sensor.name, sensor.bus) for sensor in sensors]
+        for user, channel in users:
+            if channel not in names:
+                raise ValueError(f"{user}: unknown bus {channel!r}; the buses are {', '.join(sorted(names))}")
         for bus in self.buses:
             owners: dict[int, str] = {}
             for joint in self.joints:

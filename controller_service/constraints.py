@@ -1,0 +1,98 @@
+"""Limits of torque, speed and joint range as one block l ≤ A q̈ ≤ u."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller_service.model import Array, Configuration
+from schemas.robot import RobotDescription
+
+BRAKING_SHARE = 0.5
+"""Share of the torque left beside gravity that stopping before a range limit may count on."""
+BRAKING_FLOOR = 0.1
+"""The braking torque counted on is never less than this share of the limit, so that a joint can always move."""
+RESPONSE_SHARE = 0.2
+"""Speed bounds are reached with this share of `damper_s` as time constant: fast enough not to overshoot."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConstraintRows:
+    """2n rows: first the n accelerations themselves (A = I), then the n joint torques (A = M)."""
+
+    A: Array
+    lower: Array
+    upper: Array
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.lower) // 2
+
+    def without_kinematics(self) -> ConstraintRows:
+        """Only the torque rows bound: q̈ = M⁻¹(τ − h − L s) satisfies them, so they are feasible by themselves."""
+        lower, upper = self.lower.copy(), self.upper.copy()
+        lower[: self.n] = -np.inf
+        upper[: self.n] = np.inf
+        return ConstraintRows(self.A, lower, upper)
+
+
+class JointLimits:
+    """A robot's limits, as constraints on q̈.
+
+    Torque, (33) of [Cisneros 2018] without contacts: u = M q̈ + h + L s must lie in ±τ_max, so
+    −τ_max − h − L s ≤ M q̈ ≤ τ_max − h − L s. (The paper prints + L s on both sides, a slip of sign against its (30):
+    L s is part of the torque that the motors give, so it takes away from what is left to M q̈.)
+
+    Speed and range: with the speed allowed towards the upper limit
+    v⁺ = min(q̇_max, (q_max − q)/t_d, √(2 a (q_max − q))), where a is the deceleration that a share of the torque left
+    beside h can give the joint's own inertia, q̈ ≤ (v⁺ − q̇)/t_v, t_v = max(T, t_d/5): a velocity damper with
+    braking. Below alike. Beyond a limit v⁺ is negative and leads back. l ≤ u always holds for these bounds.
+
+    Args:
+        description: of the robot.
+        damper_s: t_d.
+
+    """
+
+    def __init__(self, description: RobotDescription, damper_s: float) -> None:
+        joints = description.joints
+        self.torque = np.array([joint.torque_limit for joint in joints])
+        """(n,) [N·m]."""
+        self.speed = np.array([joint.velocity_limit for joint in joints])
+        self.position_min = np.array([joint.position_min for joint in joints])
+        self.position_max = np.array([joint.position_max for joint in joints])
+        self._damper = damper_s
+        self._response = max(description.period_s, RESPONSE_SHARE * damper_s)
+        self._n = len(joints)
+        self._A = np.vstack((np.eye(self._n), np.zeros((self._n, self._n))))
+
+    def rows(self, now: Configuration, integral: Array) -> ConstraintRows:
+        """Constraints at a configuration with the integral torque L s (n,) [N·m]."""
+        n = self._n
+        A = self._A.copy()
+        A[n:] = now.mass
+        lower, upper = np.empty(2 * n), np.empty(2 * n)
+        lower[:n], upper[:n] = self.acceleration_bounds(now)
+        offset = now.nonlinear + integral
+        lower[n:] = -self.torque - offset
+        upper[n:] = self.torque - offset
+        return ConstraintRows(A, lower, upper)
+
+    def acceleration_bounds(self, now: Configuration) -> tuple[Array, Array]:
+        """Bounds (n,) [rad/s²] on q̈ from range and speed, lower ≤ upper."""
+        left = np.maximum(self.torque - np.abs(now.nonlinear), BRAKING_FLOOR * self.torque)
+        twice_deceleration = 2.0 * BRAKING_SHARE * left / now.mass.diagonal()
+        above = self._speed_towards(self.position_max - now.position, twice_deceleration)
+        below = -self._speed_towards(now.position - self.position_min, twice_deceleration)
+        # Outside of the range on one side, the way back wins over the other side's limit
+        below = np.where(now.position > self.position_max, np.minimum(below, above), below)
+        above = np.maximum(above, below)
+        return (below - now.velocity) / self._response, (above - now.velocity) / self._response
+
+    def _speed_towards(self, distance: Array, twice_deceleration: Array) -> Array:
+        braking = np.where(distance > 0.0, np.sqrt(twice_deceleration * np.abs(distance)), np.inf)
+        damped = np.minimum(distance / self._damper, np.minimum(braking, self.speed))
+        towards: Array = np.maximum(damped, -self.speed)
+        return towards

@@ -1,0 +1,128 @@
+"""Phases by time, and the desired motions of the phase that runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller_service.model import Configuration
+from controller_service.reference import HandMotion, PostureMotion, hand_motion
+from controller_service.tasks import PoseTarget, PoseTask, PostureTarget, PostureTask, Task
+from schemas.base import ControlMode
+from schemas.controller import ControllerConfig, Phase
+from schemas.errors import ConfigurationError
+from schemas.robot import RobotDescription
+
+SHORTEST_SHARE = 0.5
+"""A posture motion entered late is done in the time left if that is at least this share of the phase."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseTime:
+    """A phase and where in it a time lies; times count on beyond the end of the last phase."""
+
+    index: int
+    phase: Phase
+    since_start_s: float
+
+    @property
+    def left_s(self) -> float:
+        """Time until the phase ends."""
+        return self.phase.duration_s - self.since_start_s
+
+
+class Schedule:
+    """The phases one after the other from sequence 0; the last is held for ever.
+
+    Raises:
+        ConfigurationError: a mode that a drive lacks, a path longer than its phase.
+
+    """
+
+    def __init__(self, description: RobotDescription, phases: tuple[Phase, ...]) -> None:
+        self._period = description.period_s
+        self._phases = phases
+        ends = np.cumsum([phase.duration_s for phase in phases])
+        self._starts = [0, *(round(float(end) / self._period) for end in ends[:-1])]
+        """Sequence at which each phase starts."""
+        needs = {ControlMode.TORQUE: "torque", ControlMode.SERVO: "servo"}
+        for index, phase in enumerate(phases):
+            for joint in description.joints:
+                if phase.mode in needs and joint.drive.kind != needs[phase.mode]:
+                    raise ConfigurationError(
+                        f"controller.phases.{index}.mode: {phase.mode.value} is not possible on joint {joint.name}: its"
+                        f" drive is of kind {joint.drive.kind}, {needs[phase.mode]!r} is needed"
+                    )
+            if phase.hand_path is not None:
+                path_s = phase.hand_path.lap_s * phase.hand_path.laps
+                if path_s > phase.duration_s * (1.0 + 1e-9):
+                    raise ConfigurationError(
+                        f"controller.phases.{index}: hand_path takes {path_s:g} s (lap_s × laps), longer than the"
+                        f" phase's duration_s {phase.duration_s:g}"
+                    )
+
+    def at(self, sequence: int) -> PhaseTime:
+        """Find the phase of a sequence number."""
+        index = len(self._starts) - 1
+        while self._starts[index] > sequence:
+            index -= 1
+        return PhaseTime(index, self._phases[index], (sequence - self._starts[index]) * self._period)
+
+
+class References:
+    """Desired posture and hand pose, kept without a jump from phase to phase.
+
+    The posture task always runs. The hand task runs in phases with a path and in phases that ask for nothing (which
+    hold posture and hand); a phase that only moves the posture leaves the hand free.
+    """
+
+    def __init__(self, description: RobotDescription, config: ControllerConfig) -> None:
+        self._names = description.joint_names
+        self._frame = description.hand_frame
+        self._config = config
+        self._index = -1
+        self._origin = 0.0
+        self._posture: PostureMotion | None = None
+        self._hand: HandMotion | None = None
+        self.posture_target: PostureTarget | None = None
+        self.hand_target: PoseTarget | None = None
+        """None while the hand task does not run."""
+
+    def forget(self) -> None:
+        """Start from the configuration of the next call, as after a mode change."""
+        self._index = -1
+        self.posture_target = None
+        self.hand_target = None
+
+    def tasks(self, time: PhaseTime, now: Configuration) -> tuple[Task, ...]:
+        """Make the tasks of a tick at a configuration."""
+        if time.index != self._index or self._posture is None:
+            self._enter(time, now)
+        elapsed = time.since_start_s - self._origin
+        assert self._posture is not None
+        self.posture_target = self._posture.at(elapsed)
+        posture = PostureTask(now, self.posture_target, self._config.posture)
+        if self._hand is None or self._frame is None:
+            return (posture,)
+        self.hand_target = self._hand.at(elapsed)
+        return posture, PoseTask(now, self._frame, self.hand_target, self._config.hand)
+
+    def _enter(self, time: PhaseTime, now: Configuration) -> None:
+        phase = time.phase
+        start = now.position if self.posture_target is None else self.posture_target.position
+        end, duration = start.copy(), phase.duration_s
+        if time.left_s >= SHORTEST_SHARE * phase.duration_s:
+            end[[self._names.index(name) for name in phase.posture]] = list(phase.posture.values())
+            duration = time.left_s
+        self._posture = PostureMotion(start, end, duration)
+        before = self.hand_target
+        self._hand = self.hand_target = None
+        if self._frame is not None and (phase.hand_path is not None or not phase.posture):
+            path = phase.hand_path
+            if path is not None and path.lap_s * path.laps > time.left_s * (1.0 + 1e-9):
+                path = None
+            frame = now.frames[self._frame]
+            pose = (frame.position, frame.rotation) if before is None else (before.position, before.rotation)
+            self._hand = hand_motion(*pose, path)
+        self._index, self._origin = time.index, time.since_start_s

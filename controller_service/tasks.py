@@ -1,0 +1,119 @@
+"""Motion tasks as values: each gives A and b of (9) of [Benallegue 2021], to be met as A q̈ = b."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from controller_service.model import Array, Configuration
+from schemas.controller import TaskGains
+
+
+@dataclass(frozen=True, slots=True)
+class PostureTarget:
+    """Desired joint motion: q^d [rad], q̇^d [rad/s], q̈^d [rad/s²], all (n,)."""
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+
+@dataclass(frozen=True, slots=True)
+class PoseTarget:
+    """Desired motion of a frame in world axes: p^d, v^d, v̇^d (3,), R^d (3, 3) frame to world, ω^d, ω̇^d (3,)."""
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+    rotation: Array
+    angular_velocity: Array
+    angular_acceleration: Array
+
+
+class Task(Protocol):
+    """A weighted linear objective on q̈."""
+
+    @property
+    def weight(self) -> float:
+        """Factor of ‖A q̈ − b‖²."""
+        ...
+
+    def linear(self) -> tuple[Array, Array]:
+        """Return A (k, n) and b (k,)."""
+        ...
+
+    def add_to(self, P: Array, q: Array) -> None:
+        """Add w AᵀA to P and −w Aᵀb to q, in place."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PostureTask:
+    """(6): q̈^ob = K_p (q^d − q) + K_v (q̇^d − q̇) + q̈^d, A = I."""
+
+    configuration: Configuration
+    target: PostureTarget
+    gains: TaskGains
+
+    @property
+    def weight(self) -> float:
+        """Factor of ‖A q̈ − b‖²."""
+        return self.gains.weight
+
+    def linear(self) -> tuple[Array, Array]:
+        """Return A (n, n), b (n,)."""
+        return np.eye(len(self.target.position)), self._objective()
+
+    def add_to(self, P: Array, q: Array) -> None:
+        """Add w I to P and −w b to q, in place."""
+        P.flat[:: len(q) + 1] += self.gains.weight
+        q -= self.gains.weight * self._objective()
+
+    def _objective(self) -> Array:
+        now, target, gains = self.configuration, self.target, self.gains
+        objective: Array = gains.stiffness * (target.position - now.position)
+        objective += gains.damping * (target.velocity - now.velocity)
+        objective += target.acceleration
+        return objective
+
+
+@dataclass(frozen=True, slots=True)
+class PoseTask:
+    """Position (7) and orientation (8) of a frame; A = J, b = [v̇^ob; ω̇^ob] − J̇ q̇ (9), (6, n) and (6,)."""
+
+    configuration: Configuration
+    frame: str
+    target: PoseTarget
+    gains: TaskGains
+
+    @property
+    def weight(self) -> float:
+        """Factor of ‖A q̈ − b‖²."""
+        return self.gains.weight
+
+    def linear(self) -> tuple[Array, Array]:
+        """Return A (6, n), b (6,)."""
+        now, target, gains = self.configuration.frames[self.frame], self.target, self.gains
+        error = np.empty(6)
+        error[:3] = target.position - now.position
+        error[3:] = orientation_error(target.rotation, now.rotation)
+        velocity = np.concatenate((target.velocity, target.angular_velocity))
+        acceleration = np.concatenate((target.acceleration, target.angular_acceleration))
+        objective = gains.stiffness * error + gains.damping * (velocity - now.velocity) + acceleration
+        return now.jacobian, objective - now.drift
+
+    def add_to(self, P: Array, q: Array) -> None:
+        """Add w JᵀJ to P and −w Jᵀb to q, in place."""
+        A, b = self.linear()
+        weighted = self.gains.weight * A.T
+        P += weighted @ A
+        q -= weighted @ b
+
+
+def orientation_error(desired: Array, current: Array) -> Array:
+    """Ω̃ = S⁻¹(log(R^d Rᵀ)) of (8): the rotation vector (3,) [rad] in world axes from `current` to `desired`."""
+    error: Array = pin.log3(desired @ current.T)
+    return error

@@ -1,0 +1,1 @@
+"""The subcommands of `cosim`, one module each; every import beyond typer waits until a command runs."""

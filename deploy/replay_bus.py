@@ -1,0 +1,193 @@
+"""Replays on the frames of the buses: the HAL's core and the plant."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from deploy.compare import HAL, PLANT, Difference, Tolerances, compare
+from hal.cycle import HalCore
+from hal.profile.frames import FRAME_BYTES, unpack
+from hal.profile.identifiers import SYNC
+from plant_service.plant import Plant
+from schemas.base import Clock
+from schemas.log import LogReader
+from schemas.messages import BusFrames, Event, JointCommand, RobotState
+from schemas.topics import BUS_PREFIX, decode
+
+STOPS = {"safe_stop": False, "emergency_stop": True}
+"""Kinds of the HAL's events that say it was stopped, and whether by emergency."""
+
+
+@dataclass(slots=True)
+class _Cycle:
+    """What a log holds of one sequence number."""
+
+    sent: dict[str, bytes] = field(default_factory=dict)
+    received: dict[str, bytes] = field(default_factory=dict)
+    state: RobotState | None = None
+    commands: list[JointCommand] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+
+def replay_hal(reader: LogReader, exact: bool) -> tuple[int, Difference | None]:
+    """Feed logged frames and commands to a fresh `HalCore`; returns the number of equal states and the first difference.
+
+    What the HAL sent is compared as well while it follows the controller.
+    """
+    cycles = _cycles(reader)
+    used = _used_commands(reader, cycles)
+    core = _fresh_core(reader, cycles)
+    if core is None:
+        return 0, None
+    tolerances: Tolerances | None = None if exact else HAL
+    buses = [bus.name for bus in reader.run.robot.description.buses]
+    compared = 0
+    for sequence, cycle in _in_order(cycles, buses):
+        assert cycle.state is not None
+        state = core.decode(sequence, [cycle.received[bus] for bus in buses])
+        if (difference := compare(sequence, "state", cycle.state, state, tolerances)) is not None:
+            return compared, difference
+        compared += 1
+        stopped = _apply_events(core, cycle)
+        command = next((each for each in cycle.commands if sequence in used and core.accepts(each)), None)
+        packets = core.apply(command)
+        if exact and command is not None and not stopped:
+            for bus, packet in zip(buses, packets, strict=True):
+                logged = _after_sync(cycle.sent[bus])
+                if logged != packet:
+                    return compared, _frame_difference(sequence, f"{BUS_PREFIX}{bus}.sent", logged, packet)
+    return compared, None
+
+
+def replay_plant(reader: LogReader, exact: bool) -> tuple[int, Difference | None]:
+    """Feed what the HAL sent, boot included, to a fresh `Plant`; returns the number of equal cycles and a difference.
+
+    Exact: the plant's frames are compared; with tolerances: the states decoded from them.
+    """
+    cycles = _cycles(reader)
+    buses = [bus.name for bus in reader.run.robot.description.buses]
+    boot = cycles.get(-1)
+    if boot is None:
+        return 0, None
+    plant = Plant(reader.run)
+    late = [plant.deliver(index, boot.sent[bus]) for index, bus in enumerate(buses)]
+    if exact:
+        for index, bus in enumerate(buses):
+            if late[index] != boot.received[bus]:
+                return 0, _frame_difference(-1, f"{BUS_PREFIX}{bus}.received", boot.received[bus], late[index])
+    late = [b""] * len(buses)
+    used = _used_commands(reader, cycles)
+    core = None if exact else _fresh_core(reader, cycles)
+    compared = 0
+    for sequence, cycle in _in_order(cycles, buses, need_state=not exact):
+        received = [late[index] + plant.deliver(index, _to_sync(cycle.sent[bus])) for index, bus in enumerate(buses)]
+        plant.advance()
+        # RPDOs arrive while the plant has integrated; what it answers to them, the HAL reads with the next reports.
+        late = [plant.deliver(index, _after_sync(cycle.sent[bus])) for index, bus in enumerate(buses)]
+        if core is None:
+            for bus, packet in zip(buses, received, strict=True):
+                if packet != cycle.received[bus]:
+                    where = f"{BUS_PREFIX}{bus}.received"
+                    return compared, _frame_difference(sequence, where, cycle.received[bus], packet)
+        else:
+            assert cycle.state is not None
+            state = core.decode(sequence, received)
+            if (difference := compare(sequence, "state", cycle.state, state, PLANT)) is not None:
+                return compared, difference
+            _apply_events(core, cycle)
+            core.apply(next((each for each in cycle.commands if sequence in used and core.accepts(each)), None))
+        compared += 1
+    return compared, None
+
+
+def _cycles(reader: LogReader) -> dict[int, _Cycle]:
+    cycles: dict[int, _Cycle] = defaultdict(_Cycle)
+    for record in reader.records():
+        if record.topic == "state":
+            state = decode(RobotState, record.data)
+            cycles[state.sequence].state = state
+        elif record.topic == "command":
+            command = decode(JointCommand, record.data)
+            cycles[command.sequence].commands.append(command)
+        elif record.topic == "event":
+            event = decode(Event, record.data)
+            if event.service == "hal":
+                cycles[event.sequence].events.append(event)
+        elif record.topic.startswith(BUS_PREFIX):
+            frames = decode(BusFrames, record.data)
+            cycles[frames.sequence].sent[frames.bus] = frames.sent
+            cycles[frames.sequence].received[frames.bus] = frames.received
+    return cycles
+
+
+def _in_order(cycles: dict[int, _Cycle], buses: list[str], *, need_state: bool = True) -> Iterator[tuple[int, _Cycle]]:
+    """Cycles from 0 on, up to the first that the log does not hold whole."""
+    sequence = 0
+    while (cycle := cycles.get(sequence)) is not None:
+        if len(cycle.sent) < len(buses) or (need_state and cycle.state is None):
+            return
+        yield sequence, cycle
+        sequence += 1
+
+
+def _used_commands(reader: LogReader, cycles: dict[int, _Cycle]) -> set[int]:
+    """Sequences whose commands were in time: all in lockstep; in realtime those that a later state shows applied."""
+    if reader.run.scenario.clock is Clock.LOCKSTEP:
+        return set(cycles)
+    return {cycle.state.applied.sequence for cycle in cycles.values() if cycle.state is not None}
+
+
+def _fresh_core(reader: LogReader, cycles: dict[int, _Cycle]) -> HalCore | None:
+    """Start a core where the boot left it: holding at the target that the first state reports as applied."""
+    first = cycles.get(0)
+    if first is None or first.state is None or first.state.applied.position is None:
+        return None
+    session = next((each.session for each in first.commands), None)
+    core = HalCore(reader.run.robot.description, session)
+    core.start(np.array(first.state.applied.position))
+    return core
+
+
+def _apply_events(core: HalCore, cycle: _Cycle) -> bool:
+    """Stop and reset as the log says it was done in this cycle; True when anything was."""
+    acted = False
+    for event in cycle.events:
+        if event.kind in STOPS:
+            core.stop(event.text, emergency=STOPS[event.kind])
+            acted = True
+        elif event.kind == "reset":
+            core.reset()
+            acted = True
+    core.drain_events()
+    return acted
+
+
+def _to_sync(packet: bytes) -> bytes:
+    return packet[: _sync_end(packet)]
+
+
+def _after_sync(packet: bytes) -> bytes:
+    return packet[_sync_end(packet) :]
+
+
+def _sync_end(packet: bytes) -> int:
+    for index, (can_id, _) in enumerate(unpack(packet)):
+        if can_id == SYNC:
+            return (index + 1) * FRAME_BYTES
+    return 0
+
+
+def _frame_difference(tick: int, where: str, logged: bytes, replayed: bytes) -> Difference:
+    """Name the first frame that differs, as `identifier#data`."""
+    one, other = (_names(packet) for packet in (logged, replayed))
+    index = next((i for i, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
+    values = [names[index] if index < len(names) else "none" for names in (one, other)]
+    return Difference(tick, f"{where}[{index}]", *values)
+
+
+def _names(packet: bytes) -> list[str]:
+    return [f"{can_id:03X}#{data.hex().upper()}" for can_id, data in unpack(packet)]

@@ -1,0 +1,43 @@
+"""One run to one log, in this process or as separate ones: what experiments and sweeps are made of."""
+
+from __future__ import annotations
+
+from io import StringIO
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+from deploy.errors import UsageError
+from deploy.inprocess import InProcess
+from deploy.launcher import LOG_NAME, launch, plan
+from deploy.monitor import open_monitor
+from deploy.progress import RunProgress
+from schemas.base import Clock
+from schemas.fingerprint import fingerprint
+from schemas.load import Run
+from schemas.log import LogWriter
+
+QUIET: Final = Console(file=StringIO())
+
+
+def run_to_log(run: Run, directory: Path, *, processes: bool = False) -> Path:
+    """Run to the end; returns the path of its log in `directory`, which is made; a log that is there is replaced.
+
+    Raises:
+        UsageError: the realtime clock in one process.
+        CosimError: the run failed.
+
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    path = directory / LOG_NAME
+    if processes:
+        path.unlink(missing_ok=True)
+        with RunProgress(run, QUIET) as progress:
+            launch(plan(run, directory), progress, open_monitor)
+        return path
+    if run.scenario.clock is not Clock.LOCKSTEP:
+        raise UsageError("a run in one process has the lockstep clock; use separate processes for realtime")
+    with LogWriter(path, run, fingerprint(run)) as log:
+        InProcess(run, log.write).run()
+    return path

@@ -1,0 +1,225 @@
+"""Ports: one face for every bus, packets of `struct can_frame` in and out."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+from collections.abc import Callable
+from typing import Protocol
+
+import can
+
+from hal.bus.address import MAX_PACKET, connect
+from hal.bus.can_frame import decode, encode, split
+from hal.bus.errors import BusError, BusLostError, BusOverflowError, BusUnavailableError
+from hal.profile.frames import FRAME_BYTES
+from schemas.robot import Bus
+
+NO_DESCRIPTOR = -1
+_NOW = socket.MSG_DONTWAIT
+
+
+class FramePort(Protocol):
+    """A bus as its user sees it; one thread uses a port."""
+
+    name: str
+
+    def send(self, frames: bytes) -> None:
+        """Send n × 16 bytes; BusLostError when the bus is gone, BusOverflowError when it takes no more."""
+
+    def receive(self, timeout_s: float) -> bytes:
+        """All that waits (n × 16 bytes), b"" after `timeout_s` [s]; BusLostError when the bus is gone."""
+
+    def fileno(self) -> int:
+        """Descriptor that is readable when frames wait, or `NO_DESCRIPTOR` when the port must be asked."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+class CosimPort:
+    """A client of a virtual bus, whole packets at a time.
+
+    Raises:
+        BusUnavailableError: nobody hosts the bus within `connect_timeout_s` [s].
+
+    """
+
+    def __init__(self, name: str, channel: str | os.PathLike[str], connect_timeout_s: float = 2.0) -> None:
+        self.name = name
+        self._socket = connect(channel, connect_timeout_s)
+
+    def send(self, frames: bytes) -> None:
+        """Send n × 16 bytes as one packet (several beyond 512 frames)."""
+        if len(frames) % FRAME_BYTES:
+            raise BusError(f"bus {self.name}: {len(frames)} bytes are not whole frames of {FRAME_BYTES} bytes")
+        try:
+            if len(frames) <= MAX_PACKET:
+                if frames:
+                    self._socket.send(frames, _NOW)
+            else:
+                for start in range(0, len(frames), MAX_PACKET):
+                    self._socket.send(frames[start : start + MAX_PACKET], _NOW)
+        except BlockingIOError as error:
+            raise BusOverflowError(f"bus {self.name}: its host has stopped to read; frames are lost") from error
+        except OSError as error:
+            raise BusLostError(f"bus {self.name} has gone: {error.strerror}") from error
+
+    def receive(self, timeout_s: float) -> bytes:
+        """All that waits, b"" after `timeout_s` [s]."""
+        packet = self._packet()
+        if packet is None:
+            if timeout_s <= 0.0 or not select.select((self._socket,), (), (), timeout_s)[0]:
+                return b""
+            packet = self._packet()
+            if packet is None:
+                return b""
+        following = self._packet()
+        if following is None:
+            return packet
+        packets = [packet]
+        while following is not None:
+            packets.append(following)
+            following = self._packet()
+        return b"".join(packets)
+
+    def fileno(self) -> int:
+        """Descriptor that is readable when frames wait."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._socket.close()
+
+    def _packet(self) -> bytes | None:
+        try:
+            packet = self._socket.recv(MAX_PACKET, _NOW)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise BusLostError(f"bus {self.name} has gone: {error.strerror}") from error
+        if not packet:
+            raise BusLostError(f"bus {self.name} has gone: its host has closed it")
+        return packet
+
+
+class PythonCanPort:
+    """Any python-can bus as a port; error and remote frames keep their flags."""
+
+    def __init__(self, name: str, bus: can.BusABC) -> None:
+        self.name = name
+        self._bus = bus
+        try:
+            self._descriptor = bus.fileno()
+        except NotImplementedError:
+            self._descriptor = NO_DESCRIPTOR
+
+    def send(self, frames: bytes) -> None:
+        """Send n × 16 bytes, a message each."""
+        if len(frames) % FRAME_BYTES:
+            raise BusError(f"bus {self.name}: {len(frames)} bytes are not whole frames of {FRAME_BYTES} bytes")
+        try:
+            for frame in split(frames):
+                self._bus.send(decode(frame))
+        except can.CanError as error:
+            raise BusLostError(f"bus {self.name} has gone: {error}") from error
+
+    def receive(self, timeout_s: float) -> bytes:
+        """All that waits, b"" after `timeout_s` [s]."""
+        received = []
+        try:
+            message = self._bus.recv(max(0.0, timeout_s))
+            while message is not None:
+                received.append(encode(message))
+                message = self._bus.recv(0.0)
+        except can.CanError as error:
+            raise BusLostError(f"bus {self.name} has gone: {error}") from error
+        return b"".join(received)
+
+    def fileno(self) -> int:
+        """Descriptor of the bus, or `NO_DESCRIPTOR` for interfaces that have none."""
+        return self._descriptor
+
+    def close(self) -> None:
+        """Shut the bus down."""
+        self._bus.shutdown()
+
+
+class DirectPort:
+    """Wiring in one process: what is sent is delivered at once, and the answer waits to be received."""
+
+    def __init__(self, name: str, deliver: Callable[[bytes], bytes]) -> None:
+        self.name = name
+        self._deliver = deliver
+        self._waiting = bytearray()
+
+    def send(self, frames: bytes) -> None:
+        """Hand n × 16 bytes over and keep the answer."""
+        self._waiting += self._deliver(frames)
+
+    def receive(self, timeout_s: float) -> bytes:
+        """All answers so far; nothing more can come by waiting."""
+        frames = bytes(self._waiting)
+        self._waiting.clear()
+        return frames
+
+    def fileno(self) -> int:
+        """Return `NO_DESCRIPTOR`."""
+        return NO_DESCRIPTOR
+
+    def close(self) -> None:
+        """Forget what waits."""
+        self._waiting.clear()
+
+
+class RecordingPort:
+    """A port that keeps a copy of what passes it, for the log."""
+
+    def __init__(self, port: FramePort) -> None:
+        self.name = port.name
+        self._port = port
+        self._sent: list[bytes] = []
+        self._received: list[bytes] = []
+
+    def send(self, frames: bytes) -> None:
+        """Send and keep n × 16 bytes."""
+        self._port.send(frames)
+        self._sent.append(frames)
+
+    def receive(self, timeout_s: float) -> bytes:
+        """Receive and keep all that waits."""
+        frames = self._port.receive(timeout_s)
+        if frames:
+            self._received.append(frames)
+        return frames
+
+    def take(self) -> tuple[bytes, bytes]:
+        """(sent, received) since the last call, each n × 16 bytes in order."""
+        taken = b"".join(self._sent), b"".join(self._received)
+        self._sent.clear()
+        self._received.clear()
+        return taken
+
+    def fileno(self) -> int:
+        """Return the port's descriptor."""
+        return self._port.fileno()
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+def open_port(bus: Bus, connect_timeout_s: float = 2.0) -> FramePort:
+    """Open a bus of a robot description: `cosim` directly, every other interface by python-can.
+
+    Raises:
+        BusUnavailableError: nobody hosts the virtual bus, or python-can cannot open the interface.
+
+    """
+    if bus.interface == "cosim":
+        return CosimPort(bus.name, bus.channel, connect_timeout_s)
+    try:
+        return PythonCanPort(bus.name, can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate))
+    except (can.CanError, OSError, ValueError, ImportError) as error:
+        raise BusUnavailableError(f"bus {bus.name}: {bus.interface} {bus.channel} cannot be opened: {error}") from error

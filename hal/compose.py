@@ -1,0 +1,95 @@
+"""From a checked command and the set-point before it to the next set-point: limits and the holding rule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hal.holding import HoldingRule
+from hal.limits import Limited, Limits, Mask
+from hal.profile.units import Array
+from hal.setpoint import HAL_DECIDED, Hold, Setpoint
+from schemas.base import ControlMode
+from schemas.robot import RobotDescription
+
+
+@dataclass(frozen=True, slots=True)
+class Composed:
+    """A set-point and the limits that acted on it."""
+
+    setpoint: Setpoint
+    acted: tuple[tuple[str, Mask], ...] = ()
+
+
+class Composer:
+    """Composes the set-points of one robot."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self._limits = Limits.of(robot)
+        self._rule = HoldingRule(robot)
+
+    def command(
+        self,
+        sequence: int,
+        mode: ControlMode,
+        arrays: dict[str, Array],
+        previous: Setpoint,
+        ahead: tuple[Array, Array],
+        motor_torque: Array,
+    ) -> Composed:
+        """Limit a command against the set-point before it.
+
+        Args:
+            sequence: the state it answers.
+            mode: its mode.
+            arrays: its arrays, checked.
+            previous: latched the cycle before this one will be.
+            ahead: position [rad] and velocity [rad/s] predicted for the latch.
+            motor_torque: measured [N·m], the torque before a change from position to torque.
+        """
+        if mode is ControlMode.TORQUE:
+            torque = self._limits.torque(arrays["torque"], motor_torque if previous.torque is None else previous.torque)
+            return Composed(Setpoint(sequence, mode, torque=torque.value), torque.acted)
+        position, hold = self._position(arrays["position"], previous, ahead)
+        if mode is ControlMode.POSITION:
+            return Composed(Setpoint(sequence, mode, position.value, hold=hold), position.acted)
+        limit = self._limits.servo_limit(arrays["torque_limit"])
+        setpoint = Setpoint(sequence, mode, position.value, torque_limit=limit.value, hold=hold)
+        return Composed(setpoint, (*position.acted, *limit.acted))
+
+    def repeat(self, previous: Setpoint) -> Setpoint:
+        """Return the last good set-point again; a holding offset goes on to ramp."""
+        return replace(previous, hold=None if previous.hold is None else previous.hold.advanced())
+
+    def safe(self, previous: Setpoint, ahead: tuple[Array, Array]) -> Setpoint:
+        """Hold: from torque mode where the joints will be at the latch, else the last applied target."""
+        if previous.torque is None:
+            return replace(self.repeat(previous), sequence=HAL_DECIDED)
+        position, velocity = ahead
+        entry = self._rule.target(previous.torque, position, velocity) - position
+        hold = Hold(entry, self._rule.cycles, self._rule.cycles)
+        return Setpoint(HAL_DECIDED, ControlMode.POSITION, position, hold=hold)
+
+    def _position(
+        self, commanded: Array, previous: Setpoint, ahead: tuple[Array, Array]
+    ) -> tuple[Limited, Hold | None]:
+        if previous.torque is None:
+            assert previous.position is not None
+            hold = None if previous.hold is None else previous.hold.advanced()
+            return self._limits.position(commanded, previous.position), hold
+        position, velocity = ahead
+        limited = self._limits.position(commanded, position)
+        entry = self._rule.target(previous.torque, position, velocity) - limited.value
+        return limited, Hold(entry, self._rule.cycles, self._rule.cycles)
+
+
+def released(setpoint: Setpoint, enabled: Mask, measured: Array) -> Setpoint:
+    """Lead the joints whose drives are not enabled along with where they are, so that enabling one cannot throw it."""
+    if setpoint.position is None:
+        return setpoint
+    position = np.where(enabled, setpoint.position, measured)
+    hold = setpoint.hold
+    if hold is not None:
+        hold = Hold(np.where(enabled, hold.entry, 0.0), hold.cycles, hold.left)
+    return replace(setpoint, position=position, hold=hold)

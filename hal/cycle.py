@@ -1,0 +1,294 @@
+"""The HAL's cycle without I/O and clock: frames in, state out; command in, frames out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from hal.commands import CommandCheck
+from hal.compose import Composer, released
+from hal.decode import Decoder, Measured
+from hal.drivers import Controlwords, DriverGroup, operation_mode
+from hal.errors import CommandRefused, DriveFaultError, HalError
+from hal.expected import expected_reports
+from hal.holding import Predictor
+from hal.limits import Onsets
+from hal.profile.cia402 import Controlword, OperationMode, next_controlword
+from hal.profile.units import Array
+from hal.setpoint import HAL_DECIDED, Setpoint, vector
+from hal.supervision import Supervisor
+from schemas.base import ControlMode
+from schemas.messages import DriveState, Event, HalStatus, JointCommand, RobotState
+from schemas.robot import RobotDescription
+
+Severity = Literal["info", "warning", "error"]
+
+
+class HalCore:
+    """One robot's cycle: `decode` after each SYNC's reports, then `apply` once; `stop` and `reset` at any time.
+
+    A set-point passes from composed to sent (`apply`, at once or a cycle later by `command_delay_cycles`) to latched
+    (the next SYNC). Only the safe stop overtakes the delay.
+    """
+
+    def __init__(self, robot: RobotDescription, session: str | None = None) -> None:
+        """Prepare for a robot.
+
+        Args:
+            robot: checked description.
+            session: the controller to obey; None: the first whose command is accepted.
+        """
+        self.robot = robot
+        self.missed_commands = 0
+        """Cycles without a command fit to be applied, since the first one that was."""
+        self.cause: HalError | None = None
+        """What made the HAL stop by itself; None while it has not."""
+        self._session = session
+        self._drivers = DriverGroup(robot)
+        self._check = CommandCheck(robot, self._drivers)
+        self._composer = Composer(robot)
+        self._supervisor = Supervisor(robot)
+        self._onsets = Onsets(len(robot.joints))
+        self._events: list[Event] = []
+        self._queue: deque[Setpoint] = deque()
+        self._all_enabled: Controlwords = np.full(len(robot.joints), Controlword.ENABLE_OPERATION, dtype=np.uint16)
+        self._servo = np.array([joint.drive.kind == "servo" for joint in robot.joints])
+        self._sequence = HAL_DECIDED
+        self._missed_in_a_row = 0
+        self._refusal: tuple[str, str | None] | None = None
+        self._commanded = False
+        self._safe_stop = False
+        self._emergency_stop = False
+        self._holding = False
+        self._expected: dict[tuple[bool, frozenset[int], frozenset[str]], tuple[frozenset[int], ...]] = {}
+        self._modes: tuple[ControlMode, ...] = (ControlMode.POSITION,) * len(robot.joints)
+        self._states: tuple[DriveState, ...] = (DriveState.OPERATION_ENABLED,) * len(robot.joints)
+        self._measured: Measured | None = None
+
+    def start(self, positions: Array) -> None:
+        """Begin after the boot: every drive in Operation Enabled, mode 8, holding at `positions` [rad].
+
+        Raises:
+            HalError: the number of positions is not the number of joints.
+        """
+        positions = np.array(positions, dtype=np.float64)
+        if positions.shape != (len(self.robot.joints),):
+            raise HalError(
+                f"start with {positions.shape} positions for {len(self.robot.joints)} joints; give one a joint"
+            )
+        self._decoder = Decoder(self.robot, positions)
+        self._predictor = Predictor(positions, self.robot.period_s)
+        self._composed = self._sent = self._latched = Setpoint(HAL_DECIDED, ControlMode.POSITION, positions)
+
+    @property
+    def status(self) -> HalStatus:
+        """Who decides what the drives do."""
+        if self._emergency_stop:
+            return HalStatus.EMERGENCY_STOP
+        return HalStatus.SAFE_STOP if self._safe_stop else HalStatus.ACTIVE
+
+    @property
+    def session(self) -> str | None:
+        """The controller obeyed."""
+        return self._session
+
+    @property
+    def expected_reports(self) -> tuple[frozenset[int], ...]:
+        """Identifiers per bus to await after the SYNC that latches what `apply` sent last; ask before `decode`."""
+        change = operation_mode(self._sent.mode) is not operation_mode(self._latched.mode)
+        key = (change, self._supervisor.silent_joints, self._supervisor.silent_sensors)
+        if key not in self._expected:
+            self._expected[key] = expected_reports(
+                self.robot, mode_change=change, silent_joints=key[1], silent_sensors=key[2]
+            )
+        return self._expected[key]
+
+    def decode(self, sequence: int, frames_per_bus: Sequence[bytes]) -> RobotState:
+        """Read the reports of SYNC `sequence`, frames of each bus in the order of the robot's buses.
+
+        Raises:
+            ProfileError: a buffer is not a whole number of frames.
+        """
+        self._sequence = sequence
+        if self._sent.mode is not self._latched.mode:
+            self._tell("mode_change", "info", f"mode {self._latched.mode.value} → {self._sent.mode.value}")
+        self._latched = self._sent
+        measured = self._measured = self._decoder.decode(frames_per_bus)
+        self._predictor.update(measured.position)
+        self._review(measured)
+        self._update_tuples(measured)
+        torque = vector(measured.motor_torque) if self._drivers.reports_torque.all() else None
+        return RobotState.model_construct(
+            sequence=sequence,
+            time_ns=sequence * self.robot.period_ns,
+            status=self.status,
+            position_measured=vector(measured.position),
+            motor_torque_measured=torque,
+            drive_state=self._states,
+            mode=self._modes,
+            error_code=tuple(measured.error_code.tolist()),
+            applied=self._latched.applied(),
+            wrenches=measured.wrenches,
+            imus=measured.imus,
+        )
+
+    def accepts(self, command: JointCommand) -> bool:
+        """Whether `apply` would take a command as the answer to the last state; a refusal is told as an event."""
+        return self._checked(command) is not None
+
+    def apply(self, command: JointCommand | None) -> tuple[bytes, ...]:
+        """Compose the next set-point and return the RPDOs to send on each bus.
+
+        Args:
+            command: answer to the state decoded last; None: none came in time, the last good one is held.
+
+        Raises:
+            HalError: nothing has been decoded yet.
+        """
+        measured = self._measured
+        if measured is None:
+            raise HalError("apply before the first decode; every cycle decodes its reports first")
+        arrays = None if command is None else self._checked(command)
+        if self.status is HalStatus.ACTIVE:
+            self._count(arrays is not None)
+        active = self.status is HalStatus.ACTIVE
+        self._sent = self._follow(command, arrays, measured) if active else self._hold(measured)
+        return self._drivers.encode(self._sent, self._controlwords(measured))
+
+    def stop(self, reason: str, emergency: bool = False) -> None:
+        """Stop from the next `apply` on; `emergency` latches until `reset`."""
+        if emergency:
+            if not self._emergency_stop:
+                self._emergency_stop = True
+                self._tell("emergency_stop", "error", f"emergency stop: {reason}; the HAL holds until it is reset")
+        elif not self._safe_stop:
+            self._safe_stop = True
+            self._tell("safe_stop", "error", f"safe stop: {reason}; the HAL holds until the run ends")
+
+    def reset(self) -> None:
+        """Clear a latched emergency stop; a safe stop stays."""
+        if not self._emergency_stop:
+            self._tell("reset", "warning", "reset without an emergency stop: nothing to clear")
+            return
+        self._emergency_stop = False
+        self._missed_in_a_row = 0
+        self._tell("reset", "info", f"emergency stop cleared, the HAL is in {self.status.value}")
+
+    def drain_events(self) -> list[Event]:
+        """Return the events since the last call, oldest first."""
+        events, self._events = self._events, []
+        return events
+
+    def _follow(self, command: JointCommand | None, arrays: dict[str, Array] | None, measured: Measured) -> Setpoint:
+        self._holding = False
+        previous, delay = self._composed, self.robot.command_delay_cycles
+        if command is None or arrays is None:
+            composed = self._composer.repeat(previous)
+        else:
+            ahead = self._predictor.ahead(delay)
+            result = self._composer.command(
+                command.sequence, command.mode, arrays, previous, ahead, measured.motor_torque
+            )
+            composed = result.setpoint
+            for limit, joint in self._onsets.update(result.acted):
+                name = self.robot.joint_names[joint]
+                self._tell("limited", "warning", f"joint {name}: command held to the {limit}", joint)
+        self._queue.append(composed)
+        while len(self._queue) < delay:
+            self._queue.appendleft(previous)
+        self._composed = composed
+        return self._queue.popleft()
+
+    def _hold(self, measured: Measured) -> Setpoint:
+        """Compose one cycle of a stop; the first drops what waits in the queue, so the stop acts at the next SYNC."""
+        previous = self._composed if self._holding else self._latched
+        self._queue.clear()
+        self._holding = True
+        held = self._composer.safe(previous, self._predictor.ahead(1))
+        enabled = self._supervisor.enabled
+        self._composed = held if enabled.all() else released(held, enabled, measured.position)
+        return self._composed
+
+    def _checked(self, command: JointCommand) -> dict[str, Array] | None:
+        try:
+            arrays = self._check.check(command, self._sequence, self._session)
+        except CommandRefused as refusal:
+            evidence = (refusal.field, refusal.joint)
+            if self.status is HalStatus.ACTIVE and evidence != self._refusal:
+                self._refusal = evidence
+                joint = None if refusal.joint is None else self.robot.joint_names.index(refusal.joint)
+                self._tell("command_refused", "warning", f"command refused: {refusal}", joint)
+            return None
+        self._refusal = None
+        if self._session is None:
+            self._session = command.session
+        return arrays
+
+    def _count(self, good: bool) -> None:
+        if good:
+            self._commanded, self._missed_in_a_row = True, 0
+            return
+        if not self._commanded and self._refusal is None:
+            return
+        self.missed_commands += 1
+        self._missed_in_a_row += 1
+        if self._missed_in_a_row == 1:
+            self._tell("command_missed", "warning", f"no command for sequence {self._sequence}; the last one is held")
+        if self._missed_in_a_row >= self.robot.safety.missed_commands:
+            self.stop(f"{self._missed_in_a_row} cycles in a row without a valid command")
+
+    def _review(self, measured: Measured) -> None:
+        ages = {sensor.name: age for sensor, age in self._decoder.sensor_ages}
+        for notice in self._supervisor.review(measured, operation_mode(self._latched.mode), ages):
+            self._tell(notice.kind, notice.severity, notice.text, notice.joint)
+            if notice.stops:
+                if self.cause is None and notice.joint is not None:
+                    joint = notice.joint
+                    state = DriveState(int(measured.drive_state[joint])).name
+                    code = int(measured.error_code[joint])
+                    self.cause = DriveFaultError(self.robot.joint_names[joint], state, code, notice.text)
+                self.stop(notice.text)
+
+    def _controlwords(self, measured: Measured) -> Controlwords:
+        if self._supervisor.enabled.all():
+            return self._all_enabled
+        states = [DriveState(state) for state in measured.drive_state.tolist()]
+        words = [
+            # A fault is reset by the boot alone, when somebody has looked at its cause.
+            Controlword.DISABLE_VOLTAGE
+            if state is DriveState.FAULT
+            else next_controlword(state, DriveState.OPERATION_ENABLED)
+            for state in states
+        ]
+        return np.array(words, dtype=np.uint16)
+
+    def _update_tuples(self, measured: Measured) -> None:
+        self._states = tuple(map(_STATES.__getitem__, measured.drive_state.tolist()))
+        csp = ControlMode.SERVO if self._latched.mode is ControlMode.SERVO else ControlMode.POSITION
+        self._modes = tuple(
+            ControlMode.TORQUE
+            if mode == OperationMode.CST
+            else (csp if servo else ControlMode.POSITION)
+            if mode == OperationMode.CSP
+            else before
+            for mode, servo, before in zip(measured.mode.tolist(), self._servo.tolist(), self._modes, strict=True)
+        )
+
+    def _tell(self, kind: str, severity: Severity, text: str, joint: int | None = None) -> None:
+        self._events.append(
+            Event(
+                sequence=self._sequence,
+                time_ns=self._sequence * self.robot.period_ns,
+                service="hal",
+                kind=kind,
+                severity=severity,
+                text=text,
+                joint=None if joint is None else self.robot.joint_names[joint],
+            )
+        )
+
+
+_STATES = tuple(DriveState)

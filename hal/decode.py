@@ -1,0 +1,260 @@
+"""From the frames of a cycle to what the robot measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hal.errors import HalError, ProfileError
+from hal.profile import identifiers, sensors
+from hal.profile.cia402 import STATE_BITS, STATE_TABLE, UNDEFINED, EmergencyCode, OperationMode
+from hal.profile.frames import FRAME_BYTES, view
+from hal.profile.objects import EMCY_STRUCT, MODE_STRUCT, STATE_LAYOUT, TPDO_MODE, TPDO_STATE
+from hal.profile.units import Array, DriveUnits
+from schemas.base import Quaternion, Vector3
+from schemas.messages import DriveState, ImuSample, WrenchSample
+from schemas.robot import ForceTorqueSensor, Imu, RobotDescription
+
+_UNKNOWN, _STATE, _MODE, _EMCY, _HEARTBEAT, _FORCE, _TORQUE, _GYRO, _ACCELERATION, _QUATERNION = range(10)
+_NO_ID: Final = 0x800
+"""Row of all identifiers that are not 11-bit data frames."""
+_ANY_BUS: Final = _NO_ID + 1
+
+HARMLESS_EMERGENCIES: Final = frozenset(
+    {
+        EmergencyCode.NO_ERROR,
+        EmergencyCode.CAN_OVERRUN,
+        EmergencyCode.CAN_PASSIVE,
+        EmergencyCode.BUS_OFF_RECOVERED,
+    }
+)
+"""Emergencies that tell of the bus and do not stop the robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something found in the frames that happened once; `stops` asks for the safe stop."""
+
+    kind: str
+    severity: Literal["info", "warning", "error"]
+    text: str
+    joint: int | None = None
+    stops: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the robot reported, arrays over the joints."""
+
+    position: Array
+    """[rad]."""
+    motor_torque: Array
+    """[N·m] at the joint; meaningless for drives that report none."""
+    drive_state: npt.NDArray[np.int8]
+    """Numbers of `DriveState`."""
+    mode: npt.NDArray[np.int8]
+    """0x6061, last report."""
+    error_code: npt.NDArray[np.uint16]
+    """0x603F, last report."""
+    silent_cycles: npt.NDArray[np.int64]
+    """Cycles since the last TPDO1; 0: it came in this cycle."""
+    wrenches: tuple[WrenchSample, ...]
+    imus: tuple[ImuSample, ...]
+    notices: tuple[Notice, ...]
+
+
+class _ForceTorque:
+    """Last reading of one force/torque sensor and the frames of the running cycle."""
+
+    def __init__(self, sensor: ForceTorqueSensor) -> None:
+        self.sensor = sensor
+        self.parts: dict[int, bytes] = {}
+        self.age = 0
+        self._last: tuple[Vector3, Vector3] | None = None
+
+    def sample(self) -> WrenchSample | None:
+        self.age += 1
+        if len(self.parts) == 2:
+            sensor = self.sensor
+            self._last = sensors.decode_force_torque(
+                self.parts[_FORCE], self.parts[_TORQUE], sensor.force_resolution, sensor.torque_resolution
+            )
+            self.age = 0
+        self.parts.clear()
+        if self._last is None:
+            return None
+        force, torque = self._last
+        return WrenchSample.model_construct(
+            name=self.sensor.name, force_in_sensor=force, torque_in_sensor=torque, age_cycles=self.age
+        )
+
+
+class _Inertial:
+    """Last reading of one inertial unit and the frames of the running cycle."""
+
+    def __init__(self, imu: Imu) -> None:
+        self.sensor = imu
+        self.parts: dict[int, bytes] = {}
+        self.age = 0
+        self._last: tuple[Vector3, Vector3, Quaternion] | None = None
+
+    def sample(self) -> ImuSample | None:
+        self.age += 1
+        if len(self.parts) == 3:
+            self._last = (
+                sensors.decode_gyro(self.parts[_GYRO]),
+                sensors.decode_acceleration(self.parts[_ACCELERATION]),
+                sensors.decode_quaternion(self.parts[_QUATERNION]),
+            )
+            self.age = 0
+        self.parts.clear()
+        if self._last is None:
+            return None
+        angular_velocity, acceleration, orientation = self._last
+        return ImuSample.model_construct(
+            name=self.sensor.name,
+            angular_velocity_in_imu=angular_velocity,
+            acceleration_in_imu=acceleration,
+            orientation_imu_to_world=orientation,
+            age_cycles=self.age,
+        )
+
+
+class Decoder:
+    """Keeps what is reported on change between the cycles; unknown identifiers and wrong lengths change nothing."""
+
+    def __init__(self, robot: RobotDescription, positions: Array) -> None:
+        """Start from drives in Operation Enabled, mode 8, at `positions` [rad] (as the boot leaves them).
+
+        Raises:
+            HalError: two nodes or sensors of one bus use the same identifier.
+        """
+        count = len(robot.joints)
+        self._joints = robot.joint_names
+        self._units = DriveUnits.of(robot)
+        self._counts = self._units.counts_from_position(np.asarray(positions, dtype=np.float64))
+        self._per_mille = np.zeros(count, dtype=np.int16)
+        self._state = np.full(count, DriveState.OPERATION_ENABLED, dtype=np.int8)
+        self._mode = np.full(count, OperationMode.CSP, dtype=np.int8)
+        self._error = np.zeros(count, dtype=np.uint16)
+        self._silent = np.zeros(count, dtype=np.int64)
+        self._force_torque = [_ForceTorque(sensor) for sensor in robot.force_torque_sensors]
+        self._inertial = [_Inertial(imu) for imu in robot.imus]
+        self._bus_base = np.arange(len(robot.buses)) * _ANY_BUS
+        self._kind = np.full(len(robot.buses) * _ANY_BUS, _UNKNOWN, dtype=np.uint8)
+        self._index = np.zeros(len(self._kind), dtype=np.intp)
+        self._length = np.zeros(len(self._kind), dtype=np.uint8)
+        self._fill_table(robot)
+
+    @property
+    def sensor_ages(self) -> tuple[tuple[ForceTorqueSensor | Imu, int], ...]:
+        """Each sensor and the cycles since its last whole reading."""
+        units: list[_ForceTorque | _Inertial] = [*self._force_torque, *self._inertial]
+        return tuple((unit.sensor, unit.age) for unit in units)
+
+    def decode(self, frames_per_bus: Sequence[bytes]) -> Measured:
+        """Read all frames of one cycle, in the order of the robot's buses.
+
+        Raises:
+            ProfileError: a buffer is not a whole number of frames.
+        """
+        if any(len(frames) % FRAME_BYTES for frames in frames_per_bus):
+            sizes = ", ".join(str(len(frames)) for frames in frames_per_bus)
+            raise ProfileError(f"buffers of {sizes} bytes: each must hold whole frames of {FRAME_BYTES} bytes")
+        frames = view(b"".join(frames_per_bus))
+        base = np.repeat(self._bus_base, [len(part) // FRAME_BYTES for part in frames_per_bus])
+        key = base + np.minimum(frames["can_id"], _NO_ID)
+        kind = np.where(frames["length"] == self._length[key], self._kind[key], _UNKNOWN)
+        notices: list[Notice] = []
+        self._silent += 1
+        is_state = kind == _STATE
+        if is_state.any():
+            self._read_states(self._index[key[is_state]], frames["data"][is_state], notices)
+        for row in np.flatnonzero(kind > _STATE).tolist():
+            data = frames["data"][row].tobytes()[: int(frames["length"][row])]
+            self._read_other(int(kind[row]), int(self._index[key[row]]), data, notices)
+        wrenches = [unit.sample() for unit in self._force_torque]
+        imus = [unit.sample() for unit in self._inertial]
+        return Measured(
+            self._units.position_from_counts(self._counts),
+            self._units.torque_from_per_mille(self._per_mille),
+            self._state.copy(),
+            self._mode.copy(),
+            self._error.copy(),
+            self._silent.copy(),
+            tuple(sample for sample in wrenches if sample is not None),
+            tuple(sample for sample in imus if sample is not None),
+            tuple(notices),
+        )
+
+    def _read_states(self, joints: npt.NDArray[np.intp], data: npt.NDArray[np.uint8], notices: list[Notice]) -> None:
+        rows = data.view(STATE_LAYOUT)[:, 0]
+        self._counts[joints] = rows["position"]
+        self._per_mille[joints] = rows["torque"]
+        states = STATE_TABLE[rows["statusword"] & STATE_BITS]
+        self._silent[joints] = 0
+        known = states != UNDEFINED
+        if known.all():
+            self._state[joints] = states
+            return
+        self._state[joints[known]] = states[known]
+        for joint, word in zip(joints[~known].tolist(), rows["statusword"][~known].tolist(), strict=True):
+            text = f"joint {self._joints[joint]}: statusword {word:#06x} is no state of CiA 402; check the drive"
+            notices.append(Notice("drive_fault", "error", text, joint, stops=True))
+
+    def _read_other(self, kind: int, index: int, data: bytes, notices: list[Notice]) -> None:
+        if kind in (_FORCE, _TORQUE):
+            if kind == _TORQUE or data[0] == sensors.FORCE_TORQUE_START:
+                self._force_torque[index].parts[kind] = data
+        elif kind in (_GYRO, _ACCELERATION, _QUATERNION):
+            if kind != _QUATERNION or any(data):
+                self._inertial[index].parts[kind] = data
+        elif kind == _MODE:
+            self._mode[index], self._error[index] = MODE_STRUCT.unpack(data)
+        elif kind == _EMCY:
+            notices.append(self._emergency(index, data))
+        elif data[0] != identifiers.HEARTBEAT_OPERATIONAL:
+            what = (
+                "was reset" if data[0] == identifiers.HEARTBEAT_BOOT_UP else f"left OPERATIONAL (NMT state {data[0]})"
+            )
+            text = f"joint {self._joints[index]}: the drive {what} during operation; restart the HAL to boot it again"
+            notices.append(Notice("node_lost", "error", text, index, stops=True))
+
+    def _emergency(self, index: int, data: bytes) -> Notice:
+        code, register, extra = EMCY_STRUCT.unpack(data)
+        name = self._joints[index]
+        if code == EmergencyCode.NO_ERROR:
+            return Notice("drive_emergency", "info", f"joint {name}: EMCY error reset", index)
+        label = EmergencyCode(code).name if code in list(EmergencyCode) else "unknown to the HAL"
+        text = f"joint {name}: EMCY {code:#06x} ({label}), register {register:#04x}, data {extra.hex(' ')}"
+        harmless = code in HARMLESS_EMERGENCIES
+        return Notice("drive_emergency", "warning" if harmless else "error", text, index, stops=not harmless)
+
+    def _fill_table(self, robot: RobotDescription) -> None:
+        for index, joint in enumerate(robot.joints):
+            bus, node = robot.bus_index(joint.drive.bus), joint.drive.node_id
+            self._claim(bus, identifiers.TPDO1 + node, _STATE, index, TPDO_STATE.size, joint.name)
+            self._claim(bus, identifiers.TPDO2 + node, _MODE, index, TPDO_MODE.size, joint.name)
+            self._claim(bus, identifiers.EMCY + node, _EMCY, index, EMCY_STRUCT.size, joint.name)
+            self._claim(bus, identifiers.HEARTBEAT + node, _HEARTBEAT, index, 1, joint.name)
+        for index, sensor in enumerate(robot.force_torque_sensors):
+            bus = robot.bus_index(sensor.bus)
+            self._claim(bus, sensor.can_id, _FORCE, index, 8, sensor.name)
+            self._claim(bus, sensor.can_id + 1, _TORQUE, index, 8, sensor.name)
+        for index, imu in enumerate(robot.imus):
+            bus = robot.bus_index(imu.bus)
+            self._claim(bus, imu.base_id + sensors.GYRO_ID, _GYRO, index, 6, imu.name)
+            self._claim(bus, imu.base_id + sensors.ACCELERATION_ID, _ACCELERATION, index, 6, imu.name)
+            self._claim(bus, imu.base_id + sensors.QUATERNION_ID, _QUATERNION, index, 8, imu.name)
+
+    def _claim(self, bus: int, can_id: int, kind: int, index: int, length: int, owner: str) -> None:
+        row = bus * _ANY_BUS + can_id
+        if self._kind[row] != _UNKNOWN:
+            raise HalError(
+                f"{owner}: identifier {can_id:#05x} is used twice on its bus; give it another node or base id"
+            )
+        self._kind[row], self._index[row], self._length[row] = kind, index, length

@@ -1,0 +1,89 @@
+"""The drive firmware's position law and its inverse, all joints at once. Torques in N·m, angles in rad, at the joint.
+
+    τ = D(k_p (q_t − q) + k_d (q̇_t − q̇)) clipped to ± torque limit,   D(x) = sign(x) max(|x| − d, 0)
+
+D is the dead zone that drive and motor current leave around zero [Del Prete 2016]; the master's target has q̇_t = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from hal.profile.units import Array, fixed
+from schemas.robot import RobotDescription
+
+SMOOTHING = 0.05
+"""Half width, as a fraction of d, of the band around zero torque over which `inverse_dead_zone` goes from −d to d."""
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareGains:
+    """Parameters of the law, arrays over the joints."""
+
+    position_gain: Array
+    """k_p [N·m/rad]."""
+    velocity_gain: Array
+    """k_d [N·m·s/rad]."""
+    dead_zone: Array
+    """d [N·m]."""
+    torque_limit: Array
+    """[N·m]."""
+
+    @classmethod
+    def of(cls, description: RobotDescription) -> Self:
+        """Nominal parameters of a robot's drives."""
+        joints = description.joints
+        return cls(
+            fixed([j.drive.position_gain for j in joints]),
+            fixed([j.drive.velocity_gain for j in joints]),
+            fixed([j.drive.dead_zone for j in joints]),
+            fixed([j.torque_limit for j in joints]),
+        )
+
+    def select(self, joints: npt.NDArray[np.intp] | slice) -> FirmwareGains:
+        """Parameters of some joints, in the order of the indices given."""
+        return FirmwareGains(
+            fixed(self.position_gain[joints]),
+            fixed(self.velocity_gain[joints]),
+            fixed(self.dead_zone[joints]),
+            fixed(self.torque_limit[joints]),
+        )
+
+
+def dead_zone(x: Array, width: Array) -> Array:
+    """D(x) = sign(x) max(|x| − d, 0)."""
+    result: Array = x - np.clip(x, -width, width)
+    return result
+
+
+def inverse_dead_zone(torque: Array, width: Array, smoothing: float = 0.0) -> Array:
+    """D⁻¹(τ) = τ + d sign(τ).
+
+    Args:
+        torque: τ to be delivered.
+        width: d.
+        smoothing: 0 is the exact inverse, 0 at zero torque. For a command given every cycle, whose sign may change
+            from one to the next, `SMOOTHING` replaces sign(τ) by τ / (smoothing · d) clipped to ±1: continuous, so it
+            cannot chatter, exact for |τ| ≥ smoothing · d, and short by less than smoothing · d below.
+    """
+    if smoothing > 0.0:
+        band = np.maximum(smoothing * width, np.finfo(np.float64).tiny)
+        return torque + width * np.clip(torque / band, -1.0, 1.0)
+    return torque + width * np.sign(torque)
+
+
+def position_torque(
+    target: Array, target_velocity: Array, position: Array, velocity: Array, gains: FirmwareGains
+) -> Array:
+    """Motor torque at the joint [N·m] of the firmware in its position modes (module's equation)."""
+    effort = gains.position_gain * (target - position) + gains.velocity_gain * (target_velocity - velocity)
+    return np.clip(dead_zone(effort, gains.dead_zone), -gains.torque_limit, gains.torque_limit)
+
+
+def holding_offset(torque: Array, velocity: Array, gains: FirmwareGains) -> Array:
+    """(D⁻¹(τ) + k_d q̇) / k_p [rad]: from the position to the target at which the firmware gives τ, with q̇_t = 0."""
+    return (inverse_dead_zone(torque, gains.dead_zone) + gains.velocity_gain * velocity) / gains.position_gain

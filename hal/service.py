@@ -1,0 +1,209 @@
+"""The HAL as a process: the master of the buses and of time, between the robot and the controller on Zenoh."""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import Final
+
+from hal.bus.ports import open_port
+from hal.errors import HalError
+from hal.master import Master
+from schemas.base import Clock
+from schemas.keys import Keys
+from schemas.lifecycle import Lifecycle, PeerLostError
+from schemas.load import Run
+from schemas.messages import HalStatus, JointCommand, OperatorRequest, RobotState
+from schemas.service import ServiceOptions
+from schemas.statistics import CycleMeter
+from schemas.topics import MalformedMessageError, decode
+from schemas.transport import TransportConfig, open_session
+
+CONNECT_S: Final = 30.0
+"""Patience with a plant that is still starting."""
+BOOT_S: Final = 10.0
+LOOK_UP_S: Final = 0.02
+"""How often signals, peers and the operator are looked at while a command is awaited."""
+REPORT_TIMEOUT_S: Final = 1.0
+"""Wall-clock wait in lockstep for the reports of a SYNC."""
+COMMAND_MARGIN: Final = 0.2
+"""Share of the period before the next SYNC that is kept for the RPDOs (realtime)."""
+SETTLE_S: Final = 0.1
+"""Simulated time that the HAL stays beyond the hold's ramp when it stops a robot."""
+
+
+class SafeStopError(HalError):
+    """The HAL has stopped the robot by itself; the message says why."""
+
+
+class HalService:
+    """The cycle of one run. Its end, whatever it is, leaves the drives holding."""
+
+    def __init__(self, run: Run, master: Master, life: Lifecycle) -> None:
+        self._run = run
+        self._robot = run.robot.description
+        self._master = master
+        self._core = master.core
+        self._life = life
+        self._keys = life.transport.keys
+        self._realtime = run.scenario.clock is Clock.REALTIME
+        self._commands = life.transport.subscribe(self._keys.command, newest=self._realtime)
+        self._operator = life.transport.subscribe(self._keys.operator)
+        self._meter = CycleMeter("hal", self._robot.period_s)
+        self._sequence = 0
+        self._next_sync_s = 0.0
+        self._begun_s = 0.0
+        self._last_error = ""
+        for key in (self._keys.state, *(self._keys.bus(bus.name) for bus in self._robot.buses)):
+            life.transport.declare_publisher(key)
+
+    def run(self) -> None:
+        """Run all cycles, then hold and leave.
+
+        Raises:
+            SafeStopError: the HAL, or an operator who did not reset it, stopped the robot before the run was over.
+            PeerLostError: the controller or the plant vanished; the robot holds.
+            BusLostError: a bus is gone; the drives hold by their own means.
+
+        """
+        core, life = self._core, self._life
+        self._next_sync_s = self._begun_s = time.monotonic()
+        try:
+            while self._sequence < self._run.cycles and core.status is not HalStatus.SAFE_STOP:
+                self._cycle()
+                if life.signalled is not None:
+                    core.stop(signal.Signals(life.signalled).name, emergency=True)
+                    break
+        except PeerLostError as loss:
+            core.stop(str(loss))
+            self._hold(self._ramp_cycles)
+            raise
+        finished = core.status is HalStatus.ACTIVE
+        if finished:
+            core.stop("end of the run")
+        self._hold(self._robot.command_delay_cycles + 1 if finished else self._ramp_cycles)
+        if not finished and life.signalled is None:
+            raise SafeStopError(f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}")
+
+    @property
+    def _ramp_cycles(self) -> int:
+        return round((self._robot.safety.hold_ramp_s + SETTLE_S) * self._robot.rate_hz)
+
+    def _cycle(self) -> None:
+        """One period: SYNC, state out, command in, RPDOs out."""
+        sequence = self._sequence
+        self._sync()
+        state = self._master.gather(sequence, 0.5 * self._robot.period_s if self._realtime else REPORT_TIMEOUT_S)
+        self._life.stamp(sequence, state.time_ns)
+        self._life.publish(self._keys.state, state)
+        self._master.apply(self._await_command(sequence))
+        self._sequence += 1
+        self._measure(state)
+
+    def _hold(self, cycles: int) -> None:
+        """Run cycles of the HAL's own: no state is published and no command awaited, the frames are logged."""
+        for _ in range(cycles):
+            self._sync()
+            self._master.gather(self._sequence, REPORT_TIMEOUT_S)
+            self._master.apply(None)
+            self._sequence += 1
+        for message in self._master.frames(self._sequence - 1):
+            self._life.publish(self._keys.bus(message.bus), message)
+        self._publish_events()
+
+    def _sync(self) -> None:
+        """Send the SYNC when its time has come, then tell of the cycle before, while the drives answer."""
+        frames = self._master.frames(self._sequence - 1)
+        if self._realtime:
+            wait = self._next_sync_s - time.monotonic()
+            if wait > 0.0:
+                time.sleep(wait)
+            elif wait < -self._robot.period_s:
+                self._meter.late_cycles += 1
+                self._next_sync_s = time.monotonic()
+            self._next_sync_s += self._robot.period_s
+        self._master.sync(self._sequence)
+        for message in frames:
+            self._life.publish(self._keys.bus(message.bus), message)
+        self._publish_events()
+
+    def _await_command(self, sequence: int) -> JointCommand | None:
+        """Wait for the answer to a state; None when it does not come in time, or the robot is stopped meanwhile."""
+        core, life = self._core, self._life
+        if self._realtime:
+            deadline = self._next_sync_s - COMMAND_MARGIN * self._robot.period_s
+        else:
+            deadline = time.monotonic() + self._robot.safety.command_timeout_s
+        while life.signalled is None:
+            remaining = deadline - time.monotonic()
+            data = self._commands.receive(min(max(remaining, 0.0), LOOK_UP_S))
+            self._serve_operator()
+            life.check_peers()
+            if data is not None:
+                command = self._decode(data)
+                if command is not None and core.accepts(command):
+                    return command
+            elif remaining <= 0.0:
+                if not self._realtime:
+                    core.stop(f"no command for sequence {sequence} in {self._robot.safety.command_timeout_s:g} s")
+                return None
+        return None
+
+    def _decode(self, data: bytes) -> JointCommand | None:
+        try:
+            return decode(JointCommand, data)
+        except MalformedMessageError as error:
+            self._life.event("command_refused", str(error), "warning")
+            return None
+
+    def _serve_operator(self) -> None:
+        while (data := self._operator.receive(0.0)) is not None:
+            try:
+                request = decode(OperatorRequest, data)
+            except MalformedMessageError as error:
+                # Whoever asks for something on this key that cannot be read is taken to mean stop.
+                self._core.stop(str(error), emergency=True)
+                return
+            if request.action == "stop":
+                self._core.stop(request.reason or "operator", emergency=True)
+            else:
+                self._core.reset()
+
+    def _publish_events(self) -> None:
+        for event in self._core.drain_events():
+            if event.severity == "error":
+                self._last_error = event.text
+            self._life.publish(self._keys.event, event)
+
+    def _measure(self, state: RobotState) -> None:
+        now = time.monotonic()
+        self._meter.cycle(now - self._begun_s)
+        self._begun_s = now
+        self._meter.missed_commands = self._core.missed_commands
+        if (summary := self._meter.report(state.sequence, state.time_ns, now)) is not None:
+            self._life.publish(self._keys.health, summary)
+
+
+def run_hal(run: Run, options: ServiceOptions) -> int:
+    """Boot the robot, run its cycles, leave it holding; returns the exit code.
+
+    Raises:
+        BusUnavailableError: a bus cannot be opened.
+        BootError: nodes missing or wrong.
+        SafeStopError, PeerLostError, BusLostError: see `HalService.run`.
+
+    """
+    scenario, robot = run.scenario, run.robot.description
+    keys = Keys(scenario.namespace, robot.name)
+    transport = open_session("hal", keys, TransportConfig(base_port=options.base_port), scenario.clock)
+    needed = tuple(peer for peer in ("plant", "controller") if peer in options.peers)
+    with Lifecycle(transport, needed) as life:
+        master = Master(robot, [open_port(bus, CONNECT_S) for bus in robot.buses], options.session)
+        try:
+            service = HalService(run, master, life)
+            life.join(options.peers)
+            master.boot(BOOT_S)
+            service.run()
+        finally:
+            master.close()
+    return 0

@@ -1,0 +1,101 @@
+"""What in the reports of a cycle is worth telling, and what must stop the robot."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from hal.decode import Measured, Notice
+from hal.profile.cia402 import OperationMode
+from schemas.messages import DriveState
+from schemas.robot import RobotDescription
+
+Mask = npt.NDArray[np.bool_]
+
+
+class Supervisor:
+    """Compares each cycle's reports with what they should be; tells each finding once, at its onset."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        count = len(robot.joints)
+        self._joints = robot.joint_names
+        self._patience = robot.safety.sync_timeout_cycles
+        self._enabled: Mask = np.ones(count, dtype=bool)
+        self._wrong_mode = np.zeros(count, dtype=np.int64)
+        self._silent_sensors: frozenset[str] = frozenset()
+        self.enabled: Mask = self._enabled
+        """Drives in Operation Enabled."""
+        self.silent_joints: frozenset[int] = frozenset()
+        """Joints whose drives have been silent for `sync_timeout_cycles`."""
+
+    @property
+    def silent_sensors(self) -> frozenset[str]:
+        """Sensors without a whole reading for `sync_timeout_cycles`."""
+        return self._silent_sensors
+
+    def review(self, measured: Measured, mode: OperationMode, sensor_ages: dict[str, int]) -> list[Notice]:
+        """List the findings of one cycle.
+
+        Args:
+            measured: the decoded cycle.
+            mode: that every drive should be in since this SYNC.
+            sensor_ages: cycles since the last whole reading of each sensor.
+        """
+        notices = list(measured.notices)
+        self._review_states(measured, notices)
+        self._review_silence(measured, notices)
+        self._review_modes(measured, mode, notices)
+        self._review_sensors(sensor_ages, notices)
+        return notices
+
+    def _review_states(self, measured: Measured, notices: list[Notice]) -> None:
+        before, self.enabled = self.enabled, measured.drive_state == DriveState.OPERATION_ENABLED
+        if before.all() and self.enabled.all():
+            return
+        for joint in np.flatnonzero(before & ~self.enabled).tolist():
+            state = DriveState(int(measured.drive_state[joint])).name
+            code = int(measured.error_code[joint])
+            text = f"joint {self._joints[joint]}: drive went to {state}, error code {code:#06x}"
+            notices.append(Notice("drive_fault", "error", text, joint, stops=True))
+        for joint in np.flatnonzero(~before & self.enabled).tolist():
+            text = f"joint {self._joints[joint]}: drive is enabled again"
+            notices.append(Notice("drive_enabled", "info", text, joint))
+
+    def _review_silence(self, measured: Measured, notices: list[Notice]) -> None:
+        if not measured.silent_cycles.any():
+            self.silent_joints = frozenset()
+            return
+        for joint in np.flatnonzero(measured.silent_cycles == 1).tolist():
+            text = f"joint {self._joints[joint]}: no report of the drive in this cycle; the last one is kept"
+            notices.append(Notice("report_missing", "warning", text, joint))
+        for joint in np.flatnonzero(measured.silent_cycles == self._patience).tolist():
+            text = f"joint {self._joints[joint]}: drive silent for {self._patience} cycles; check its power and its bus"
+            notices.append(Notice("node_lost", "error", text, joint, stops=True))
+        silent = np.flatnonzero(measured.silent_cycles >= self._patience).tolist()
+        self.silent_joints = frozenset(silent)
+
+    def _review_modes(self, measured: Measured, mode: OperationMode, notices: list[Notice]) -> None:
+        wrong = self.enabled & (measured.mode != mode)
+        if not wrong.any():
+            self._wrong_mode[:] = 0
+            return
+        self._wrong_mode = np.where(wrong, self._wrong_mode + 1, 0)
+        for joint in np.flatnonzero(self._wrong_mode == self._patience).tolist():
+            text = (
+                f"joint {self._joints[joint]}: drive reports mode {int(measured.mode[joint])}, commanded is {int(mode)}"
+                f" for {self._patience} cycles"
+            )
+            notices.append(Notice("mode_refused", "error", text, joint, stops=True))
+
+    def _review_sensors(self, ages: dict[str, int], notices: list[Notice]) -> None:
+        silent = frozenset(name for name, age in ages.items() if age >= self._patience)
+        lost = f"no reading for {self._patience} cycles; check its power and its bus"
+        notices.extend(
+            Notice("sensor_silent", "warning", f"sensor {name}: {lost}")
+            for name in sorted(silent - self._silent_sensors)
+        )
+        notices.extend(
+            Notice("sensor_back", "info", f"sensor {name}: readings arrive again")
+            for name in sorted(self._silent_sensors - silent)
+        )
+        self._silent_sensors = silent

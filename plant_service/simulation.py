@@ -1,0 +1,234 @@
+"""The simulated robot: firmware, motors, friction and rigid bodies, advanced one bus period at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NoReturn
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from plant_service.axis import Axis
+from plant_service.errors import DivergedError, PlantError
+from plant_service.firmware import Firmware
+from plant_service.friction import DryFriction
+from plant_service.joint_axis import JointAxis
+from plant_service.model import PlantModel, build
+from plant_service.sensors import Sensors
+from schemas.load import Robot
+from schemas.messages import DriveState, PlantTruth, PoseSample
+from schemas.scenario import PlantConfig
+
+Array = NDArray[np.float64]
+
+# Warnings are counted in the data and end the run; MuJoCo would also write them to a file in the working directory.
+mujoco.set_mju_user_warning(lambda _: None)
+
+
+class Simulation:
+    """One robot from its start at time 0. The same robot, configuration, seed and calls give the same bits.
+
+    Between two calls of `advance` the state is that of a SYNC: the simulated drives read and command `axes`, the
+    simulated sensors read `sensors`. At the start every drive is off and its brake holds.
+    """
+
+    def __init__(self, robot: Robot, config: PlantConfig, seed: int) -> None:
+        description = robot.description
+        self._description = description
+        self._config = config
+        self._plant: PlantModel = build(robot, config, seed)
+        self._model = self._plant.model
+        self._data = mujoco.MjData(self._model)
+        self._warnings = self._data.warning.number
+        self._substeps = round(description.period_s / config.substep_s)
+        joints = description.joints
+        gear = np.array([joint.gear_ratio for joint in joints])
+        self._friction = DryFriction(config.friction, gear, np.array([joint.torque_limit for joint in joints]))
+        self._firmware = Firmware(description, config, seed)
+        self.axes: tuple[Axis, ...] = tuple(JointAxis(self._firmware, index) for index in range(len(joints)))
+        """One axis a joint, for the simulated drives."""
+        self.sensors = Sensors(description, self._model, config.noise, seed)
+        """Readings of the last sample."""
+        self._frames = self._truth_frames()
+        self._loads: dict[str, tuple[Array, Array]] = {}
+
+        self._position = np.array(self._plant.initial_position)
+        self._velocity = np.zeros(len(joints))
+        self._acceleration = np.zeros(len(joints))
+        self._motor_torque = np.zeros((0, len(joints)))
+        self._friction_torque = np.zeros(len(joints))
+        self._mode = self._firmware.mode.copy()
+        self._contact_force = 0.0
+        self._periods = 0
+
+        self._joints = _as_slice(self._plant.qpos_address)
+        self._dofs = _as_slice(self._plant.dof_address)
+        self._data.qpos[self._joints] = self._position
+        self._sensors_on = self._model.opt.disableflags
+        self._sensors_off = self._sensors_on | mujoco.mjtDisableBit.mjDSBL_SENSOR
+        self._apply_brakes()
+        mujoco.mj_forward(self._model, self._data)
+        self._sample_constraints(self._velocity)
+        self._firmware.sample(self._position, self._velocity)
+        self.sensors.sample(self._data.sensordata)
+
+    @property
+    def time_ns(self) -> int:
+        """Simulated time [ns]: periods × the description's `period_ns`."""
+        return self._periods * self._description.period_ns
+
+    @property
+    def plant(self) -> PlantModel:
+        """The compiled model and its maps."""
+        return self._plant
+
+    @property
+    def kinetic_energy(self) -> float:
+        """½ q̇ᵀ M q̇ [J], rotors included."""
+        mujoco.mj_energyVel(self._model, self._data)
+        return float(self._data.energy[1])
+
+    def apply_wrench(
+        self, link: str, point_in_link: Sequence[float] | None = None, force_in_world: Sequence[float] | None = None
+    ) -> None:
+        """Push a point of a link [m, in the link's frame] with a force [N, in the world] until told otherwise.
+
+        The force follows the point from period to period. Without force the link is released.
+
+        Raises:
+            PlantError: the robot has no such link.
+
+        """
+        if link not in self._plant.frame_bodies:
+            raise PlantError(f"apply_wrench: {self._description.name} has no link {link!r}")
+        if force_in_world is None:
+            self._loads.pop(link, None)
+            self._data.xfrc_applied[self._plant.frame_bodies[link]] = 0.0
+        else:
+            self._loads[link] = (np.array(point_in_link or (0.0, 0.0, 0.0)), np.array(force_in_world))
+
+    def advance(self) -> None:
+        """Integrate one period: for each substep the firmware's law, then the bodies; then sample for the next SYNC.
+
+        Raises:
+            DivergedError: MuJoCo warns: numbers are not finite or huge, or a buffer is full.
+
+        """
+        model, data, firmware = self._model, self._data, self._firmware
+        qpos, qvel, qfrc, loss = data.qpos, data.qvel, data.qfrc_applied, model.dof_frictionloss
+        joints, dof = self._joints, self._dofs
+        scale = self._config.torque_scale
+        self._mode[:] = firmware.mode
+        self._apply_loads()
+        if firmware.brakes_changed:
+            self._apply_brakes()
+            mujoco.mj_step1(model, data)
+        firmware.begin_period()
+        torques = np.empty((self._substeps, len(self.axes)))
+        position, velocity = self._position, self._velocity
+        last = self._substeps - 1
+        model.opt.disableflags = self._sensors_off
+        for index, torque in enumerate(torques):
+            np.multiply(firmware.step(index, position, velocity), scale, out=torque)
+            qfrc[dof] = torque
+            if index == last:
+                model.opt.disableflags = self._sensors_on
+                previous = velocity.copy()
+            mujoco.mj_step2(model, data)
+            position, velocity = qpos[joints], qvel[dof]
+            if index == last:
+                self._sample_constraints(previous)
+            loss[dof] = self._friction.bound(velocity)
+            mujoco.mj_step1(model, data)
+        self._acceleration = (velocity - previous) / self._config.substep_s
+        self._position, self._velocity, self._motor_torque = position, velocity, torques
+        self._periods += 1
+        if np.count_nonzero(self._warnings):
+            self._raise_diverged()
+        firmware.end_period(position, velocity)
+        self.sensors.sample(data.sensordata)
+
+    def truth(self, sequence: int, drive_states: Sequence[DriveState]) -> PlantTruth:
+        """Tell what is true at this SYNC.
+
+        Accelerations, friction and contact forces are those of the substep that ended here. Friction is signed as it
+        acts: M q̈ + h = motor_torque + friction_torque (+ limits and contacts).
+        """
+        torques = self._motor_torque
+        now = torques[-1] if len(torques) else np.zeros(len(self._position))
+        return PlantTruth(
+            sequence=sequence,
+            time_ns=self.time_ns,
+            position=tuple(self._position.tolist()),
+            velocity=tuple(self._velocity.tolist()),
+            acceleration=tuple(self._acceleration.tolist()),
+            mode=tuple(self._mode.tolist()),
+            drive_state=tuple(drive_states),
+            motor_torque=tuple(now.tolist()),
+            motor_torque_substeps=tuple(map(tuple, torques.tolist())),
+            friction_torque=tuple(self._friction_torque.tolist()),
+            frames={name: self.pose(name) for name in self._frames},
+            sensor_wrenches=dict(self.sensors.true_wrenches),
+            contact_force=self._contact_force,
+            kinetic_energy=self.kinetic_energy,
+        )
+
+    def pose(self, link: str) -> PoseSample:
+        """Tell the true pose of a URDF link's frame in the world."""
+        body = self._plant.frame_bodies[link]
+        x, y, z = self._data.xpos[body].tolist()
+        quaternion = self._data.xquat[body].tolist()
+        return PoseSample(position_in_world=(x, y, z), orientation_to_world=quaternion)
+
+    def _truth_frames(self) -> tuple[str, ...]:
+        hand = self._description.hand_frame
+        return tuple(dict.fromkeys([*([hand] if hand else []), *self._config.truth_frames]))
+
+    def _apply_brakes(self) -> None:
+        self._friction.set_brakes(self._firmware.braked)
+        self._model.dof_frictionloss[self._dofs] = self._friction.bound(self._velocity)
+        self._firmware.brakes_changed = False
+
+    def _apply_loads(self) -> None:
+        data = self._data
+        for link, (point, force) in self._loads.items():
+            body = self._plant.frame_bodies[link]
+            arm = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point - data.xipos[body]
+            data.xfrc_applied[body, :3] = force
+            data.xfrc_applied[body, 3:] = np.cross(arm, force)
+
+    def _raise_diverged(self) -> NoReturn:
+        kind = mujoco.mjtWarning(int(np.flatnonzero(self._warnings)[0])).name.removeprefix("mjWARN_")
+        fastest = int(np.argmax(np.abs(np.nan_to_num(self._velocity, nan=np.inf))))
+        raise DivergedError(
+            f"{self._description.joint_names[fastest]}: velocity {self._velocity[fastest]:g} rad/s at"
+            f" {self.time_ns * 1e-9:g} s, MuJoCo reports {kind}. Lower plant.substep_s or the drives' gains."
+        )
+
+    def _sample_constraints(self, velocity: Array) -> None:
+        """Take friction and contact forces while the constraint solution still stands."""
+        data, model = self._data, self._model
+        dof = self._dofs
+        if data.nefc == data.nf:
+            dry = data.qfrc_constraint[dof]
+        else:
+            rows = slice(data.ne, data.ne + data.nf)
+            every = np.zeros(model.nv)
+            every[data.efc_id[rows]] = data.efc_force[rows]
+            dry = every[dof]
+        self._friction_torque = dry - model.dof_damping[dof] * velocity
+        self._contact_force = 0.0
+        contacts = data.ncon
+        if contacts == 0:
+            return
+        wrench = np.empty(6)
+        for contact in range(contacts):
+            mujoco.mj_contactForce(model, data, contact, wrench)
+            self._contact_force += float(np.linalg.norm(wrench[:3]))
+
+
+def _as_slice(indices: NDArray[np.intp]) -> slice | NDArray[np.intp]:
+    """Consecutive indices as a slice, which costs a fifth."""
+    first, count = int(indices[0]), len(indices)
+    return slice(first, first + count) if (indices == np.arange(first, first + count)).all() else indices

@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from hal.decode import Decoder
+from hal.errors import HalError, ProfileError
+from schemas.messages import DriveState
+from tests.hal.robots import FAULT, frame, imu, mode_report, report, robot, wrist
+
+
+def decoder(*kinds: str) -> Decoder:
+    description = robot(*kinds, force_torque_sensors=(wrist(),), imus=(imu(),))
+    return Decoder(description, np.zeros(len(kinds)))
+
+
+def test_state_reports_in_any_order_on_both_buses() -> None:
+    measured = decoder("torque", "torque", "torque").decode(
+        [report(3, 409600, -1000) + report(1, 4096), report(2, -409600, 100, FAULT)]
+    )
+    assert measured.position == pytest.approx([2 * np.pi / 100, 0.1 + 2 * np.pi, 0.2 + 2 * np.pi])
+    assert measured.motor_torque == pytest.approx([0.0, -5.0, -50.0])
+    assert measured.drive_state.tolist() == [DriveState.OPERATION_ENABLED, DriveState.FAULT, DriveState.OPERATION_ENABLED]
+    assert measured.silent_cycles.tolist() == [0, 0, 0]
+
+
+def test_the_last_of_two_reports_counts() -> None:
+    measured = decoder("torque").decode([report(1, 1) + report(1, 409600), b""])
+    assert measured.position[0] == pytest.approx(2 * np.pi)
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        frame(0x181, b"\0" * 7),
+        frame(0x181 | 0x80000000, b"\0" * 8),
+        frame(0x181 | 0x40000000, b"\0" * 8),
+        frame(0x7FF, b"\0" * 8),
+        frame(0x1FFFFFFF | 0x80000000, b"\0" * 8),
+        frame(0x182, struct.pack("<Hih", 0x0008, 5, 5)),
+        frame(0x080, b""),
+        frame(0x281, b"\x0a\x00"),
+        frame(0x081, b"\x10"),
+    ],
+)
+def test_foreign_and_short_frames_change_nothing(foreign: bytes) -> None:
+    unit = decoder("torque", "torque")
+    before = unit.decode([report(1, 77), report(2, 88)])
+    after = unit.decode([foreign, b""])
+    assert after.position.tolist() == before.position.tolist()
+    assert after.drive_state.tolist() == before.drive_state.tolist()
+    assert after.mode.tolist() == before.mode.tolist()
+    assert after.silent_cycles.tolist() == [1, 1]
+    assert after.notices == ()
+
+
+def test_modes_and_errors_are_kept_between_reports() -> None:
+    unit = decoder("torque", "torque")
+    unit.decode([report(1) + mode_report(1, 10, 0x7305), report(2)])
+    measured = unit.decode([report(1), report(2)])
+    assert measured.mode.tolist() == [10, 8]
+    assert measured.error_code.tolist() == [0x7305, 0]
+
+
+def test_an_undefined_statusword_stops_and_keeps_the_state() -> None:
+    measured = decoder("torque").decode([report(1, statusword=0x0001), b""])
+    (notice,) = measured.notices
+    assert (notice.kind, notice.joint, notice.stops) == ("drive_fault", 0, True)
+    assert measured.drive_state.tolist() == [DriveState.OPERATION_ENABLED]
+
+
+def test_emergencies_name_joint_and_code() -> None:
+    unit = decoder("torque", "torque")
+    data = struct.pack("<HB5s", 0x7305, 0x21, b"\1\2\3\4\5")
+    (notice,) = unit.decode([b"", frame(0x082, data)]).notices
+    assert notice.stops
+    assert notice.joint == 1
+    assert "j1: EMCY 0x7305 (INCREMENTAL_SENSOR_FAULT), register 0x21, data 01 02 03 04 05" in notice.text
+    (passive,) = unit.decode([frame(0x081, struct.pack("<HB5s", 0x8120, 0x11, b"")), b""]).notices
+    assert (passive.severity, passive.stops) == ("warning", False)
+    (reset,) = unit.decode([frame(0x081, bytes(8)), b""]).notices
+    assert (reset.severity, reset.stops) == ("info", False)
+    (unknown,) = unit.decode([frame(0x081, struct.pack("<HB5s", 0xFF01, 0x81, b"")), b""]).notices
+    assert "unknown to the HAL" in unknown.text
+
+
+def test_a_boot_up_in_operation_is_a_lost_node() -> None:
+    unit = decoder("torque")
+    assert unit.decode([frame(0x701, b"\x05"), b""]).notices == ()
+    (reset,) = unit.decode([frame(0x701, b"\x00"), b""]).notices
+    assert (reset.kind, reset.stops) == ("node_lost", True)
+    assert "was reset" in reset.text
+    (left,) = unit.decode([frame(0x701, b"\x7f"), b""]).notices
+    assert "left OPERATIONAL" in left.text
+
+
+def test_sensors_are_absent_until_whole_and_then_age() -> None:
+    unit = decoder("torque")
+    first, second = frame(0x50, bytes.fromhex("0b0032ffce01f403")), frame(0x51, bytes.fromhex("e8fc180000000000"))
+    assert unit.decode([b"", first]).wrenches == ()
+    assert unit.decode([b"", second]).wrenches == ()
+    (wrench,) = unit.decode([b"", first + second]).wrenches
+    assert wrench.force_in_sensor == pytest.approx((1.0, -1.0, 10.0))
+    assert wrench.torque_in_sensor == pytest.approx((0.5, -0.5, 0.0))
+    assert wrench.age_cycles == 0
+    assert unit.decode([b"", b""]).wrenches[0].age_cycles == 1
+    wrong_mark = frame(0x50, bytes.fromhex("0c0032ffce01f403"))
+    assert unit.decode([b"", wrong_mark + second]).wrenches[0].age_cycles == 2
+
+
+def test_inertial_units_need_all_three_frames() -> None:
+    unit = decoder("torque")
+    gyro = frame(0x432, bytes.fromhex("0200fe000100"))
+    acceleration = frame(0x434, bytes.fromhex("0000000009d0"))
+    orientation = frame(0x421, bytes.fromhex("7fff000000000000"))
+    assert unit.decode([gyro + acceleration, b""]).imus == ()
+    (sample,) = unit.decode([orientation + gyro + acceleration, b""]).imus
+    assert sample.angular_velocity_in_imu == (1.0, -1.0, 0.5)
+    assert sample.acceleration_in_imu == (0.0, 0.0, 9.8125)
+    assert sample.orientation_imu_to_world == (1.0, 0.0, 0.0, 0.0)
+    assert unit.decode([gyro, b""]).imus[0].age_cycles == 1
+
+
+def test_broken_buffers_and_doubled_identifiers_are_refused() -> None:
+    with pytest.raises(ProfileError, match="whole frames"):
+        decoder("torque").decode([report(1)[:-1], b""])
+    clash = wrist().model_copy(update={"bus": "a", "can_id": 0x181})
+    with pytest.raises(HalError, match="wrist: identifier 0x181 is used twice"):
+        Decoder(robot("torque", force_torque_sensors=(clash,)), np.zeros(1))
