@@ -84,15 +84,14 @@ class JointLimits:
         """Bounds (n,) [rad/s²] on q̈ from range and speed, lower ≤ upper."""
         left = np.maximum(self.torque - np.abs(now.nonlinear), BRAKING_FLOOR * self.torque)
         twice_deceleration = 2.0 * BRAKING_SHARE * left / now.mass.diagonal()
-        above = self._speed_towards(self.position_max - now.position, twice_deceleration)
-        below = -self._speed_towards(now.position - self.position_min, twice_deceleration)
+        distance = np.empty((2, self._n))
+        np.subtract(self.position_max, now.position, out=distance[0])
+        np.subtract(now.position, self.position_min, out=distance[1])
+        braking = np.sqrt(twice_deceleration * np.abs(distance))
+        braking[distance < 0.0] = np.inf
+        speed = np.maximum(np.minimum(np.minimum(distance / self._damper, braking), self.speed), -self.speed)
+        above, below = speed[0], -speed[1]
         # Outside of the range on one side, the way back wins over the other side's limit
         below = np.where(now.position > self.position_max, np.minimum(below, above), below)
         above = np.maximum(above, below)
         return (below - now.velocity) / self._response, (above - now.velocity) / self._response
-
-    def _speed_towards(self, distance: Array, twice_deceleration: Array) -> Array:
-        braking = np.where(distance > 0.0, np.sqrt(twice_deceleration * np.abs(distance)), np.inf)
-        damped = np.minimum(distance / self._damper, np.minimum(braking, self.speed))
-        towards: Array = np.maximum(damped, -self.speed)
-        return towards

@@ -110,13 +110,14 @@ class Controller:
         """Answer a state.
 
         Raises:
-            StateError: out of sequence, wrong number of joints, no motor torque although torque mode needs it.
+            StateError: out of sequence, wrong number of joints, not finite, or without the motor torque that torque
+                mode starts from.
             QpError: see `AccelerationQp`.
             ControllerError: a command that is not finite.
 
         """
-        cycles = self._accept(state)
-        estimate = self._estimator.estimate(np.array(state.position_measured), cycles)
+        measured, cycles = self._accept(state)
+        estimate = self._estimator.estimate(measured, cycles)
         if state.motor_torque_measured is not None:
             self._torques.append(np.array(state.motor_torque_measured))
         time = self._schedule.at(state.sequence)
@@ -133,12 +134,16 @@ class Controller:
         self._acceleration = tick.solution.x
         return self._command(state, tick), self._trace(state, time, estimate, tick)
 
-    def _accept(self, state: RobotState) -> int:
+    def _accept(self, state: RobotState) -> tuple[Array, int]:
         if len(state.position_measured) != self._n:
             raise StateError(
                 f"state {state.sequence} has {len(state.position_measured)} positions, the robot has {self._n} joints:"
                 " is another robot running under the same namespace?"
             )
+        measured = np.array(state.position_measured)
+        if not np.isfinite(measured).all():
+            worst = int(np.argmin(np.isfinite(measured)))
+            raise StateError(f"state {state.sequence}: position of {self._model.names[worst]} is {measured[worst]}")
         cycles = 1 if self._sequence is None else state.sequence - self._sequence
         if cycles < 1:
             raise StateError(
@@ -146,7 +151,7 @@ class Controller:
                 " Is there a second HAL under the same namespace?"
             )
         self._sequence = state.sequence
-        return cycles
+        return measured, cycles
 
     def _next_stage(self, state: RobotState, wanted: ControlMode) -> Stage:
         if state.status is not HalStatus.ACTIVE:
@@ -256,7 +261,7 @@ class Controller:
                 f"state {state.sequence}: the {tick.mode.value} command of {self._model.names[worst]} is {value[worst]}"
             )
         vector = tuple(value.tolist())
-        return JointCommand.model_construct(
+        return JointCommand(
             session=self._session,
             sequence=state.sequence,
             time_ns=state.time_ns,
@@ -269,8 +274,12 @@ class Controller:
     def _trace(self, state: RobotState, time: PhaseTime, estimate: Estimate, tick: _Tick) -> ControllerTrace:
         desired, measured = self._references.hand_target, None
         if self._frame is not None:
-            measured = _pose(*self._model.pose(estimate.position, self._frame))
-        return ControllerTrace.model_construct(
+            frame = tick.now.frames[self._frame]
+            open_loop = self._stage is Stage.POSITION
+            measured = _pose(
+                *(self._model.pose(estimate.position, self._frame) if open_loop else (frame.position, frame.rotation))
+            )
+        return ControllerTrace(
             sequence=state.sequence,
             time_ns=state.time_ns,
             phase=time.phase.name,
@@ -299,4 +308,5 @@ def _firmware_target(state: RobotState) -> Array:
 
 def _pose(position: Array, rotation: Array) -> PoseSample:
     x, y, z, w = pin.Quaternion(rotation).coeffs().tolist()
-    return PoseSample.model_construct(position_in_world=tuple(position.tolist()), orientation_to_world=(w, x, y, z))
+    px, py, pz = position.tolist()
+    return PoseSample(position_in_world=(px, py, pz), orientation_to_world=(w, x, y, z))

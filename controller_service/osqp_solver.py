@@ -18,8 +18,10 @@ ACCURACIES = (1e-2, 1e-4, 1e-6, 1e-8)
 """OSQP's own tolerances, one after the other until the polished point is within ours; mostly the first is enough."""
 INFINITY = 1e30
 """OSQP's."""
-POLISHING_PASSES = 6
+POLISHING_PASSES = 20
 """Corrections of the active set that the polishing may make."""
+BLOCK_PASSES = 5
+"""As many of these change all rows that disagree, the rest one row each."""
 
 
 class OsqpSolver:
@@ -111,7 +113,7 @@ class OsqpSolver:
             x, scaled = np.array(found.x), np.array(found.y)
             dual = scaled / (length * cost)
             if dual.any() and "infeasible" not in status:
-                x, dual = _polish(q, A, lower, upper, factor, x, dual, scaled * length)
+                x, dual = _polish(q, A, lower, upper, factor, x, dual, scaled * length, length)
             errors = residuals(P, q, A, lower, upper, x, dual)
             if max(errors) <= self._tolerance:
                 status = SOLVED
@@ -130,7 +132,7 @@ class OsqpSolver:
 
 
 def _polish(
-    q: Array, A: Array, lower: Array, upper: Array, factor: Array, x: Array, dual: Array, pull: Array
+    q: Array, A: Array, lower: Array, upper: Array, factor: Array, x: Array, dual: Array, pull: Array, length: Array
 ) -> tuple[Array, Array]:
     """Point and multipliers of the active rows' equations, the active set corrected while signs or bounds disagree.
 
@@ -143,7 +145,7 @@ def _polish(
     at_upper = upper - Ax < pull
     at_lower = Ax - lower < -pull
     inverse = lapack.dpotrs(factor, np.column_stack((A.T, q)), lower=1)[0]
-    for _ in range(POLISHING_PASSES):
+    for done in range(POLISHING_PASSES):
         rows = np.flatnonzero(at_upper | at_lower)
         if len(rows) > n:
             return x, dual
@@ -156,12 +158,18 @@ def _polish(
                 return x, dual
             y[rows] = lapack.dpotrs(gram, -(bound + A[rows] @ free), lower=1)[0]
         point = -(free + inverse[:, :-1] @ y)
-        Ax = A @ point
-        slack = 1e-9 * (1.0 + np.abs(Ax))
+        point_Ax = A @ point
+        slack = 1e-9 * (1.0 + np.abs(point_Ax))
         wrong = (at_upper & (y < 0.0)) | (at_lower & (y > 0.0))
-        over, under = Ax > upper + slack, Ax < lower - slack
+        over, under = point_Ax > upper + slack, point_Ax < lower - slack
         if not (wrong | over | under).any():
             return point, y
+        if done >= BLOCK_PASSES:  # one row at a time, lest the set goes round in circles
+            blame = np.where(wrong, np.abs(y) * length, np.maximum(point_Ax - upper, lower - point_Ax) / length)
+            worst = int(np.argmax(np.where(wrong | over | under, blame, -1.0)))
+            single = np.zeros_like(wrong)
+            single[worst] = True
+            wrong, over, under = wrong & single, over & single, under & single
         at_upper = (at_upper & ~wrong) | over
         at_lower = (at_lower & ~wrong) | under
     return x, dual

@@ -83,6 +83,8 @@ class References:
         self._config = config
         self._index = -1
         self._origin = 0.0
+        self._end = 0.0
+        """When, after the origin, the entered phase is over and its motions have ended."""
         self._posture: PostureMotion | None = None
         self._hand: HandMotion | None = None
         self.posture_target: PostureTarget | None = None
@@ -110,13 +112,15 @@ class References:
 
     def _enter(self, time: PhaseTime, now: Configuration) -> None:
         phase = time.phase
-        start = now.position if self.posture_target is None else self.posture_target.position
+        start = now.position
+        if self._posture is not None and self.posture_target is not None:
+            start = self._posture.at(self._end).position
         end, duration = start.copy(), phase.duration_s
         if time.left_s >= SHORTEST_SHARE * phase.duration_s:
             end[[self._names.index(name) for name in phase.posture]] = list(phase.posture.values())
             duration = time.left_s
         self._posture = PostureMotion(start, end, duration)
-        before = self.hand_target
+        before = None if self._hand is None or self.hand_target is None else self._hand.at(self._end)
         self._hand = self.hand_target = None
         if self._frame is not None and (phase.hand_path is not None or not phase.posture):
             path = phase.hand_path
@@ -125,4 +129,4 @@ class References:
             frame = now.frames[self._frame]
             pose = (frame.position, frame.rotation) if before is None else (before.position, before.rotation)
             self._hand = hand_motion(*pose, path)
-        self._index, self._origin = time.index, time.since_start_s
+        self._index, self._origin, self._end = time.index, time.since_start_s, time.left_s

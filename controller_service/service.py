@@ -6,14 +6,13 @@ import time
 
 from controller_service.controller import Controller
 from schemas.base import Clock
-from schemas.keys import Keys
 from schemas.lifecycle import Lifecycle
 from schemas.load import Run
 from schemas.messages import RobotState
 from schemas.service import ServiceOptions
 from schemas.statistics import CycleMeter
 from schemas.topics import decode
-from schemas.transport import TransportConfig, open_session
+from schemas.transport import open_service
 
 LOOK_UP_S = 0.1
 """How often signals and peers are looked at while no state comes."""
@@ -27,13 +26,12 @@ def run_controller(run: Run, options: ServiceOptions) -> int:
         CosimError: what the controller refuses; the HAL then stops the robot by itself.
 
     """
-    scenario, robot = run.scenario, run.robot.description
-    keys = Keys(scenario.namespace, robot.name)
     controller = Controller(run, options.session)
-    meter = CycleMeter("controller", robot.period_s)
-    transport = open_session("controller", keys, TransportConfig(base_port=options.base_port), scenario.clock)
+    meter = CycleMeter("controller", run.robot.description.period_s)
+    transport = open_service("controller", run, options)
+    keys = transport.keys
     with Lifecycle(transport, needed=("hal",)) as life:
-        states = transport.subscribe(keys.state, newest=scenario.clock is Clock.REALTIME)
+        states = transport.subscribe(keys.state, newest=run.scenario.clock is Clock.REALTIME)
         for key in (keys.command, keys.trace):
             transport.declare_publisher(key)
         life.join(options.peers)

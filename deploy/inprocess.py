@@ -52,7 +52,7 @@ class InProcess:
         self._log_frames(BOOT_SEQUENCE)
 
     def step(self) -> None:
-        """Run one cycle; the plant integrates its interval before the controller answers, as it may by the clock's rule."""
+        """Run one cycle; the plant integrates its interval before the controller answers, as the clock allows."""
         state = self._exchange()
         self._sink("state", state)
         self._advance()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +15,9 @@ from deploy.series import Array, RunSeries
 
 BEFORE_S = 0.05
 AFTER_S = 0.15
-STYLE = {
+SMALLEST_SPAN = 1.0
+"""[N·m] or [°]; a smaller range of values is not blown up to the height of the plot."""
+STYLE: dict[str, dict[str, Any]] = {
     "reference": {"color": "black", "linewidth": 1.6},
     "computed": {"color": "#7b3294", "linewidth": 1.2},
     "integral": {"color": "#2166ac", "linewidth": 1.2},
@@ -109,10 +112,17 @@ def _grid(count: int, title: str) -> tuple[Figure, list[Axes]]:
 
 
 def _finish(figure: Figure, axes: Sequence[Axes], x_label: str, y_label: str) -> None:
+    last_of_column = axes[-min(3, len(axes)) :]
     for axis in axes:
         axis.grid(alpha=0.3)
         axis.tick_params(labelsize=8)
-    figure.supxlabel(x_label, fontsize=10)
+        low, high = axis.get_ylim()
+        if high - low < SMALLEST_SPAN:
+            middle = 0.5 * (low + high)
+            axis.set_ylim(middle - 0.5 * SMALLEST_SPAN, middle + 0.5 * SMALLEST_SPAN)
+    for axis in last_of_column:
+        axis.set_xlabel(x_label, fontsize=9)
+        axis.tick_params(labelbottom=True)
     figure.supylabel(y_label, fontsize=10)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9, frameon=False)

@@ -34,7 +34,7 @@ class _Cycle:
 
 
 def replay_hal(reader: LogReader, exact: bool) -> tuple[int, Difference | None]:
-    """Feed logged frames and commands to a fresh `HalCore`; returns the number of equal states and the first difference.
+    """Feed logged frames and commands to a fresh `HalCore`; returns the number of equal states and a difference.
 
     What the HAL sent is compared as well while it follows the controller.
     """
@@ -190,4 +190,9 @@ def _frame_difference(tick: int, where: str, logged: bytes, replayed: bytes) -> 
 
 
 def _names(packet: bytes) -> list[str]:
-    return [f"{can_id:03X}#{data.hex().upper()}" for can_id, data in unpack(packet)]
+    """Write each frame as identifier and data, and the bytes beyond its length where they are not zero."""
+    names = []
+    for index, (can_id, data) in enumerate(unpack(packet)):
+        beyond = packet[index * FRAME_BYTES + 8 + len(data) : (index + 1) * FRAME_BYTES]
+        names.append(f"{can_id:03X}#{data.hex().upper()}" + (f" +{beyond.hex()}" if any(beyond) else ""))
+    return names

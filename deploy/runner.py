@@ -11,7 +11,7 @@ from rich.console import Console
 from deploy.errors import UsageError
 from deploy.inprocess import InProcess
 from deploy.launcher import LOG_NAME, launch, plan
-from deploy.monitor import open_monitor
+from deploy.monitor import RunMonitor
 from deploy.progress import RunProgress
 from schemas.base import Clock
 from schemas.fingerprint import fingerprint
@@ -34,7 +34,7 @@ def run_to_log(run: Run, directory: Path, *, processes: bool = False) -> Path:
     if processes:
         path.unlink(missing_ok=True)
         with RunProgress(run, QUIET) as progress:
-            launch(plan(run, directory), progress, open_monitor)
+            launch(plan(run, directory), progress, RunMonitor)
         return path
     if run.scenario.clock is not Clock.LOCKSTEP:
         raise UsageError("a run in one process has the lockstep clock; use separate processes for realtime")

@@ -176,4 +176,4 @@ def _rows(values: list[tuple[float, ...]] | list[tuple[float, float, float]], n:
 
 
 def _seconds(times_ns: list[int]) -> Array:
-    return np.array(times_ns, np.int64) * 1e-9
+    return np.array(times_ns, np.float64) * 1e-9

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hal.holding import HoldingRule
+from hal.holding import HoldingRule, Predictor
 from hal.limits import Limited, Limits, Mask
 from hal.profile.units import Array
 from hal.setpoint import HAL_DECIDED, Hold, Setpoint
@@ -28,6 +28,7 @@ class Composer:
     def __init__(self, robot: RobotDescription) -> None:
         self._limits = Limits.of(robot)
         self._rule = HoldingRule(robot)
+        self._naive = robot.safety.holding == "none"
 
     def command(
         self,
@@ -35,7 +36,8 @@ class Composer:
         mode: ControlMode,
         arrays: dict[str, Array],
         previous: Setpoint,
-        ahead: tuple[Array, Array],
+        predictor: Predictor,
+        delay: int,
         motor_torque: Array,
     ) -> Composed:
         """Limit a command against the set-point before it.
@@ -45,13 +47,14 @@ class Composer:
             mode: its mode.
             arrays: its arrays, checked.
             previous: latched the cycle before this one will be.
-            ahead: position [rad] and velocity [rad/s] predicted for the latch.
+            predictor: of the positions measured so far.
+            delay: cycles until the latch.
             motor_torque: measured [N·m], the torque before a change from position to torque.
         """
         if mode is ControlMode.TORQUE:
             torque = self._limits.torque(arrays["torque"], motor_torque if previous.torque is None else previous.torque)
             return Composed(Setpoint(sequence, mode, torque=torque.value), torque.acted)
-        position, hold = self._position(arrays["position"], previous, ahead)
+        position, hold = self._position(arrays["position"], previous, predictor, delay)
         if mode is ControlMode.POSITION:
             return Composed(Setpoint(sequence, mode, position.value, hold=hold), position.acted)
         limit = self._limits.servo_limit(arrays["torque_limit"])
@@ -62,24 +65,26 @@ class Composer:
         """Return the last good set-point again; a holding offset goes on to ramp."""
         return replace(previous, hold=None if previous.hold is None else previous.hold.advanced())
 
-    def safe(self, previous: Setpoint, ahead: tuple[Array, Array]) -> Setpoint:
-        """Hold: from torque mode where the joints will be at the latch, else the last applied target."""
+    def safe(self, previous: Setpoint, predictor: Predictor) -> Setpoint:
+        """Hold from the next SYNC on: from torque mode where the joints will be then, else the last applied target."""
         if previous.torque is None:
             return replace(self.repeat(previous), sequence=HAL_DECIDED)
-        position, velocity = ahead
+        position, velocity = predictor.ahead(1)
         entry = self._rule.target(previous.torque, position, velocity) - position
         hold = Hold(entry, self._rule.cycles, self._rule.cycles)
         return Setpoint(HAL_DECIDED, ControlMode.POSITION, position, hold=hold)
 
     def _position(
-        self, commanded: Array, previous: Setpoint, ahead: tuple[Array, Array]
+        self, commanded: Array, previous: Setpoint, predictor: Predictor, delay: int
     ) -> tuple[Limited, Hold | None]:
         if previous.torque is None:
             assert previous.position is not None
             hold = None if previous.hold is None else previous.hold.advanced()
             return self._limits.position(commanded, previous.position), hold
-        position, velocity = ahead
+        position, velocity = predictor.ahead(delay)
         limited = self._limits.position(commanded, position)
+        if self._naive:
+            return limited, None
         entry = self._rule.target(previous.torque, position, velocity) - limited.value
         return limited, Hold(entry, self._rule.cycles, self._rule.cycles)
 

@@ -55,6 +55,8 @@ class HalCore:
         self._events: list[Event] = []
         self._queue: deque[Setpoint] = deque()
         self._all_enabled: Controlwords = np.full(len(robot.joints), Controlword.ENABLE_OPERATION, dtype=np.uint16)
+        self._reports_torque = bool(self._drivers.reports_torque.all())
+        self._seen: tuple[bytes, bytes, ControlMode] | None = None
         self._servo = np.array([joint.drive.kind == "servo" for joint in robot.joints])
         self._sequence = HAL_DECIDED
         self._missed_in_a_row = 0
@@ -120,7 +122,7 @@ class HalCore:
         self._predictor.update(measured.position)
         self._review(measured)
         self._update_tuples(measured)
-        torque = vector(measured.motor_torque) if self._drivers.reports_torque.all() else None
+        torque = vector(measured.motor_torque) if self._reports_torque else None
         return RobotState.model_construct(
             sequence=sequence,
             time_ns=sequence * self.robot.period_ns,
@@ -188,9 +190,8 @@ class HalCore:
         if command is None or arrays is None:
             composed = self._composer.repeat(previous)
         else:
-            ahead = self._predictor.ahead(delay)
             result = self._composer.command(
-                command.sequence, command.mode, arrays, previous, ahead, measured.motor_torque
+                command.sequence, command.mode, arrays, previous, self._predictor, delay, measured.motor_torque
             )
             composed = result.setpoint
             for limit, joint in self._onsets.update(result.acted):
@@ -207,9 +208,10 @@ class HalCore:
         previous = self._composed if self._holding else self._latched
         self._queue.clear()
         self._holding = True
-        held = self._composer.safe(previous, self._predictor.ahead(1))
-        enabled = self._supervisor.enabled
-        self._composed = held if enabled.all() else released(held, enabled, measured.position)
+        held = self._composer.safe(previous, self._predictor)
+        supervisor = self._supervisor
+        all_enabled = supervisor.all_enabled
+        self._composed = held if all_enabled else released(held, supervisor.enabled, measured.position)
         return self._composed
 
     def _checked(self, command: JointCommand) -> dict[str, Array] | None:
@@ -241,8 +243,8 @@ class HalCore:
             self.stop(f"{self._missed_in_a_row} cycles in a row without a valid command")
 
     def _review(self, measured: Measured) -> None:
-        ages = {sensor.name: age for sensor, age in self._decoder.sensor_ages}
-        for notice in self._supervisor.review(measured, operation_mode(self._latched.mode), ages):
+        mode = operation_mode(self._latched.mode)
+        for notice in self._supervisor.review(measured, mode, self._decoder.sensor_ages):
             self._tell(notice.kind, notice.severity, notice.text, notice.joint)
             if notice.stops:
                 if self.cause is None and notice.joint is not None:
@@ -253,7 +255,7 @@ class HalCore:
                 self.stop(notice.text)
 
     def _controlwords(self, measured: Measured) -> Controlwords:
-        if self._supervisor.enabled.all():
+        if self._supervisor.all_enabled:
             return self._all_enabled
         states = [DriveState(state) for state in measured.drive_state.tolist()]
         words = [
@@ -266,6 +268,10 @@ class HalCore:
         return np.array(words, dtype=np.uint16)
 
     def _update_tuples(self, measured: Measured) -> None:
+        seen = (measured.drive_state.tobytes(), measured.mode.tobytes(), self._latched.mode)
+        if seen == self._seen:
+            return
+        self._seen = seen
         self._states = tuple(map(_STATES.__getitem__, measured.drive_state.tolist()))
         csp = ControlMode.SERVO if self._latched.mode is ControlMode.SERVO else ControlMode.POSITION
         self._modes = tuple(

@@ -23,6 +23,10 @@ _UNKNOWN, _STATE, _MODE, _EMCY, _HEARTBEAT, _FORCE, _TORQUE, _GYRO, _ACCELERATIO
 _NO_ID: Final = 0x800
 """Row of all identifiers that are not 11-bit data frames."""
 _ANY_BUS: Final = _NO_ID + 1
+_DATA: Final = 8
+"""Where the data begin in a frame."""
+_PLANS: Final = 256
+"""Plans kept; more orders of frames than this mean that none repeats."""
 
 HARMLESS_EMERGENCIES: Final = frozenset(
     {
@@ -65,6 +69,18 @@ class Measured:
     wrenches: tuple[WrenchSample, ...]
     imus: tuple[ImuSample, ...]
     notices: tuple[Notice, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """Where in a cycle's frames everything is."""
+
+    joints: npt.NDArray[np.intp]
+    """Of the TPDO1s, in their order."""
+    rows: npt.NDArray[np.intp]
+    """Of the TPDO1s among the frames."""
+    others: tuple[tuple[int, int, int, int], ...]
+    """Kind, index of joint or sensor, and the data's first and last byte of every other known frame."""
 
 
 class _ForceTorque:
@@ -144,6 +160,8 @@ class Decoder:
         self._silent = np.zeros(count, dtype=np.int64)
         self._force_torque = [_ForceTorque(sensor) for sensor in robot.force_torque_sensors]
         self._inertial = [_Inertial(imu) for imu in robot.imus]
+        self._sensors: list[_ForceTorque | _Inertial] = [*self._force_torque, *self._inertial]
+        self._plans: dict[tuple[tuple[int, ...], bytes], _Plan] = {}
         self._bus_base = np.arange(len(robot.buses)) * _ANY_BUS
         self._kind = np.full(len(robot.buses) * _ANY_BUS, _UNKNOWN, dtype=np.uint8)
         self._index = np.zeros(len(self._kind), dtype=np.intp)
@@ -151,10 +169,9 @@ class Decoder:
         self._fill_table(robot)
 
     @property
-    def sensor_ages(self) -> tuple[tuple[ForceTorqueSensor | Imu, int], ...]:
-        """Each sensor and the cycles since its last whole reading."""
-        units: list[_ForceTorque | _Inertial] = [*self._force_torque, *self._inertial]
-        return tuple((unit.sensor, unit.age) for unit in units)
+    def sensor_ages(self) -> dict[str, int]:
+        """Cycles since each sensor's last whole reading, by its name."""
+        return {unit.sensor.name: unit.age for unit in self._sensors}
 
     def decode(self, frames_per_bus: Sequence[bytes]) -> Measured:
         """Read all frames of one cycle, in the order of the robot's buses.
@@ -165,40 +182,59 @@ class Decoder:
         if any(len(frames) % FRAME_BYTES for frames in frames_per_bus):
             sizes = ", ".join(str(len(frames)) for frames in frames_per_bus)
             raise ProfileError(f"buffers of {sizes} bytes: each must hold whole frames of {FRAME_BYTES} bytes")
-        frames = view(b"".join(frames_per_bus))
-        base = np.repeat(self._bus_base, [len(part) // FRAME_BYTES for part in frames_per_bus])
-        key = base + np.minimum(frames["can_id"], _NO_ID)
-        kind = np.where(frames["length"] == self._length[key], self._kind[key], _UNKNOWN)
+        packet = b"".join(frames_per_bus)
+        words = np.frombuffer(packet, "<u8")
+        plan = self._plan(tuple(map(len, frames_per_bus)), packet, words[0::2])
         notices: list[Notice] = []
-        self._silent += 1
-        is_state = kind == _STATE
-        if is_state.any():
-            self._read_states(self._index[key[is_state]], frames["data"][is_state], notices)
-        for row in np.flatnonzero(kind > _STATE).tolist():
-            data = frames["data"][row].tobytes()[: int(frames["length"][row])]
-            self._read_other(int(kind[row]), int(self._index[key[row]]), data, notices)
+        self._silent = self._silent + 1
+        if len(plan.joints):
+            self._read_states(plan.joints, words[1::2].take(plan.rows).view(STATE_LAYOUT), notices)
+        for kind, index, start, end in plan.others:
+            self._read_other(kind, index, packet[start:end], notices)
         wrenches = [unit.sample() for unit in self._force_torque]
         imus = [unit.sample() for unit in self._inertial]
         return Measured(
             self._units.position_from_counts(self._counts),
             self._units.torque_from_per_mille(self._per_mille),
-            self._state.copy(),
-            self._mode.copy(),
-            self._error.copy(),
-            self._silent.copy(),
+            self._state,
+            self._mode,
+            self._error,
+            self._silent,
             tuple(sample for sample in wrenches if sample is not None),
             tuple(sample for sample in imus if sample is not None),
             tuple(notices),
         )
 
-    def _read_states(self, joints: npt.NDArray[np.intp], data: npt.NDArray[np.uint8], notices: list[Notice]) -> None:
-        rows = data.view(STATE_LAYOUT)[:, 0]
+    def _plan(self, sizes: tuple[int, ...], packet: bytes, heads: npt.NDArray[np.uint64]) -> _Plan:
+        """Sort the frames of a cycle; cycles with the same identifiers and lengths in the same order share a plan."""
+        signature = (sizes, heads.tobytes())
+        plan = self._plans.get(signature)
+        if plan is None:
+            if len(self._plans) >= _PLANS:
+                self._plans.clear()
+            plan = self._plans[signature] = self._sort(sizes, view(packet))
+        return plan
+
+    def _sort(self, sizes: tuple[int, ...], frames: npt.NDArray[np.void]) -> _Plan:
+        base = np.repeat(self._bus_base, [size // FRAME_BYTES for size in sizes])
+        key = base + np.minimum(frames["can_id"], _NO_ID)
+        kind = np.where(frames["length"] == self._length[key], self._kind[key], _UNKNOWN)
+        rows = np.flatnonzero(kind == _STATE)
+        others = []
+        for row in np.flatnonzero(kind > _STATE).tolist():
+            start = row * FRAME_BYTES + _DATA
+            others.append((int(kind[row]), int(self._index[key[row]]), start, start + int(frames["length"][row])))
+        return _Plan(self._index[key[rows]], rows, tuple(others))
+
+    def _read_states(self, joints: npt.NDArray[np.intp], rows: npt.NDArray[np.void], notices: list[Notice]) -> None:
         self._counts[joints] = rows["position"]
         self._per_mille[joints] = rows["torque"]
         states = STATE_TABLE[rows["statusword"] & STATE_BITS]
         self._silent[joints] = 0
+        # What was handed out before stays as it was: new arrays for what changes.
+        self._state = self._state.copy()
         known = states != UNDEFINED
-        if known.all():
+        if np.count_nonzero(known) == len(known):
             self._state[joints] = states
             return
         self._state[joints[known]] = states[known]
@@ -214,6 +250,7 @@ class Decoder:
             if kind != _QUATERNION or any(data):
                 self._inertial[index].parts[kind] = data
         elif kind == _MODE:
+            self._mode, self._error = self._mode.copy(), self._error.copy()
             self._mode[index], self._error[index] = MODE_STRUCT.unpack(data)
         elif kind == _EMCY:
             notices.append(self._emergency(index, data))

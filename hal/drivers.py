@@ -64,14 +64,12 @@ class Driver(ABC):
         """Prepare frames whose data fields are those of a PDO's layout."""
         assert layout.names is not None
         assert layout.fields is not None
-        fields = [layout.fields[name] for name in layout.names]
-        spec = {
-            "names": ["can_id", "length", *layout.names],
-            "formats": ["<u4", "u1", *(field[0] for field in fields)],
-            "offsets": [0, 4, *(8 + field[1] for field in fields)],
-            "itemsize": FRAME_BYTES,
-        }
-        frames = np.zeros(len(self.joints), np.dtype(spec))  # type: ignore[call-overload] # numpy's stubs want a literal
+        body = [(name, layout.fields[name][0]) for name in layout.names]
+        # Every byte belongs to a field: numpy does not promise to copy padding, and these bytes go on the bus.
+        fields = [("can_id", "<u4"), ("length", "u1"), ("pad", "V3"), *body, ("tail", f"V{8 - layout.itemsize}")]
+        if layout.itemsize == 8:
+            fields.pop()
+        frames = np.zeros(len(self.joints), np.dtype(fields))
         frames["can_id"] = self._nodes + base
         frames["length"] = layout.itemsize
         if mode is not None:

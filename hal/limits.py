@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from hal.profile.units import Array, fixed
+from hal.profile.units import Array, bounded, fixed
 from schemas.robot import RobotDescription
 
 Mask = npt.NDArray[np.bool_]
@@ -52,19 +52,19 @@ class Limits:
 
         The velocity limit comes last: a joint found outside its range is led back, not thrown.
         """
-        in_range = np.clip(commanded, self.position_min, self.position_max)
-        value = np.clip(in_range, previous - self.position_step, previous + self.position_step)
+        in_range = bounded(commanded, self.position_min, self.position_max)
+        value = bounded(in_range, previous - self.position_step, previous + self.position_step)
         return Limited(value, (("position range", in_range != commanded), ("velocity limit", value != in_range)))
 
     def torque(self, commanded: Array, previous: Array) -> Limited:
         """Clamp to the torque limit, then to one cycle's change from the previous torque."""
-        in_range = np.clip(commanded, -self.torque_limit, self.torque_limit)
-        value = np.clip(in_range, previous - self.torque_step, previous + self.torque_step)
+        in_range = bounded(commanded, -self.torque_limit, self.torque_limit)
+        value = bounded(in_range, previous - self.torque_step, previous + self.torque_step)
         return Limited(value, (("torque limit", in_range != commanded), ("torque rate limit", value != in_range)))
 
     def servo_limit(self, commanded: Array) -> Limited:
         """Clamp a servo's torque limit to what the joint stands, from 0 upwards."""
-        value = np.clip(commanded, 0.0, self.torque_limit)
+        value = bounded(commanded, 0.0, self.torque_limit)
         return Limited(value, (("torque limit", value != commanded),))
 
 
@@ -80,7 +80,7 @@ class Onsets:
         onsets = []
         for name, mask in acted:
             before = self._acting.get(name)
-            if mask.any():
+            if np.count_nonzero(mask):
                 new = mask if before is None else mask & ~before
                 onsets += [(name, int(joint)) for joint in np.flatnonzero(new)]
             self._acting[name] = mask

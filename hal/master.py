@@ -57,7 +57,7 @@ class Master:
             port.send(packet)
 
     def gather(self, sequence: int, timeout_s: float) -> RobotState:
-        """Await all reports of this SYNC, up to a time, and decode them; what is missing shows in the state's events."""
+        """Await all reports of this SYNC, up to a time, and decode them; what is missing becomes an event."""
         for received in self._received:
             received.clear()
         self._missing = [set(expected) for expected in self.core.expected_reports]

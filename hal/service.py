@@ -10,14 +10,13 @@ from hal.bus.ports import open_port
 from hal.errors import HalError
 from hal.master import Master
 from schemas.base import Clock
-from schemas.keys import Keys
 from schemas.lifecycle import Lifecycle, PeerLostError
 from schemas.load import Run
 from schemas.messages import HalStatus, JointCommand, OperatorRequest, RobotState
 from schemas.service import ServiceOptions
 from schemas.statistics import CycleMeter
 from schemas.topics import MalformedMessageError, decode
-from schemas.transport import TransportConfig, open_session
+from schemas.transport import open_service
 
 CONNECT_S: Final = 30.0
 """Patience with a plant that is still starting."""
@@ -193,11 +192,9 @@ def run_hal(run: Run, options: ServiceOptions) -> int:
         SafeStopError, PeerLostError, BusLostError: see `HalService.run`.
 
     """
-    scenario, robot = run.scenario, run.robot.description
-    keys = Keys(scenario.namespace, robot.name)
-    transport = open_session("hal", keys, TransportConfig(base_port=options.base_port), scenario.clock)
+    robot = run.robot.description
     needed = tuple(peer for peer in ("plant", "controller") if peer in options.peers)
-    with Lifecycle(transport, needed) as life:
+    with Lifecycle(open_service("hal", run, options), needed) as life:
         master = Master(robot, [open_port(bus, CONNECT_S) for bus in robot.buses], options.session)
         try:
             service = HalService(run, master, life)

@@ -57,17 +57,6 @@ class Setpoint:
             raise HalError(f"a set-point of mode {self.mode} holds no position")
         return self.position if self.hold is None else self.position + self.hold.offset
 
-    @property
-    def required_torque(self) -> Array:
-        """`torque` [N·m].
-
-        Raises:
-            HalError: not in torque mode.
-        """
-        if self.torque is None:
-            raise HalError(f"a set-point of mode {self.mode} holds no torque")
-        return self.torque
-
     def applied(self) -> AppliedCommand:
         """Make the message that reports it."""
         return AppliedCommand.model_construct(

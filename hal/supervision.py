@@ -12,6 +12,8 @@ from schemas.robot import RobotDescription
 
 Mask = npt.NDArray[np.bool_]
 
+_ENABLED = int(DriveState.OPERATION_ENABLED)
+
 
 class Supervisor:
     """Compares each cycle's reports with what they should be; tells each finding once, at its onset."""
@@ -20,10 +22,12 @@ class Supervisor:
         count = len(robot.joints)
         self._joints = robot.joint_names
         self._patience = robot.safety.sync_timeout_cycles
-        self._enabled: Mask = np.ones(count, dtype=bool)
+        self._count = count
         self._wrong_mode = np.zeros(count, dtype=np.int64)
         self._silent_sensors: frozenset[str] = frozenset()
-        self.enabled: Mask = self._enabled
+        self.all_enabled = True
+        """Every drive is in Operation Enabled."""
+        self.enabled: Mask = np.ones(count, dtype=bool)
         """Drives in Operation Enabled."""
         self.silent_joints: frozenset[int] = frozenset()
         """Joints whose drives have been silent for `sync_timeout_cycles`."""
@@ -49,8 +53,9 @@ class Supervisor:
         return notices
 
     def _review_states(self, measured: Measured, notices: list[Notice]) -> None:
-        before, self.enabled = self.enabled, measured.drive_state == DriveState.OPERATION_ENABLED
-        if before.all() and self.enabled.all():
+        before, self.enabled = self.enabled, measured.drive_state == _ENABLED
+        all_before, self.all_enabled = self.all_enabled, np.count_nonzero(self.enabled) == self._count
+        if all_before and self.all_enabled:
             return
         for joint in np.flatnonzero(before & ~self.enabled).tolist():
             state = DriveState(int(measured.drive_state[joint])).name
@@ -62,7 +67,7 @@ class Supervisor:
             notices.append(Notice("drive_enabled", "info", text, joint))
 
     def _review_silence(self, measured: Measured, notices: list[Notice]) -> None:
-        if not measured.silent_cycles.any():
+        if not np.count_nonzero(measured.silent_cycles):
             self.silent_joints = frozenset()
             return
         for joint in np.flatnonzero(measured.silent_cycles == 1).tolist():
@@ -75,10 +80,11 @@ class Supervisor:
         self.silent_joints = frozenset(silent)
 
     def _review_modes(self, measured: Measured, mode: OperationMode, notices: list[Notice]) -> None:
-        wrong = self.enabled & (measured.mode != mode)
-        if not wrong.any():
+        wrong = measured.mode != int(mode)
+        if not np.count_nonzero(wrong):
             self._wrong_mode[:] = 0
             return
+        wrong &= self.enabled
         self._wrong_mode = np.where(wrong, self._wrong_mode + 1, 0)
         for joint in np.flatnonzero(self._wrong_mode == self._patience).tolist():
             text = (
@@ -89,6 +95,8 @@ class Supervisor:
 
     def _review_sensors(self, ages: dict[str, int], notices: list[Notice]) -> None:
         silent = frozenset(name for name, age in ages.items() if age >= self._patience)
+        if silent == self._silent_sensors:
+            return
         lost = f"no reading for {self._patience} cycles; check its power and its bus"
         notices.extend(
             Notice("sensor_silent", "warning", f"sensor {name}: {lost}")

@@ -71,7 +71,7 @@ class Firmware:
         self._target = np.zeros(n)
         self._goal = np.zeros(n)
         self._target_velocity = np.zeros(n)
-        self._holding = np.zeros(n, dtype=bool)
+        self._held: set[int] = set()
         self._hold_offset = np.zeros(n)
         self._hold_final = np.zeros(n)
         self._hold_elapsed = np.zeros(n)
@@ -90,7 +90,7 @@ class Firmware:
         zero, resolution = self._units.zero_offset, self._units.radian_per_count
         targets = self._target + self._fractions * (self._goal - self._target)
         self._bias = self._stiffness * (targets - zero) + self._damping * self._target_velocity + self._feedforward
-        np.multiply(self._stiffness, resolution, out=self._count_stiffness)
+        self._count_stiffness = self._stiffness * resolution
 
     def step(self, substep: int, position: Array, velocity: Array) -> Array:
         """Nominal motor torques [N·m] at true joint positions and velocities, shape (n,), in one substep of the period.
@@ -118,7 +118,7 @@ class Firmware:
         """Close the interpolation at SYNC and sample encoder, velocity and current at the true state, shape (n,)."""
         self._target[:] = self._goal
         self._target_velocity[:] = 0.0
-        if self._holding.any():
+        if self._held:
             self._advance_holding()
         self.sample(position, velocity)
 
@@ -163,7 +163,7 @@ class Firmware:
         q_t = q + (D⁻¹(τ) + k_d q̇) / k_p with q̇_t = 0. From torque mode or power off the ramp ends at q; a drive that
         was following positions keeps its last target, and the ramp ends there.
         """
-        if self._holding[joint]:
+        if joint in self._held:
             return
         one = slice(joint, joint + 1)
         gains = FirmwareGains(
@@ -175,7 +175,7 @@ class Firmware:
         self._set_law(joint, POSITION, self._position_gain[joint], self._velocity_gain[joint], 0.0)
         if was_off:
             self._set_limit(joint, float(self._own_limit[joint]))
-        self._holding[joint] = True
+        self._held.add(joint)
         self._hold_offset[joint] = start - final
         self._hold_final[joint] = final
         self._hold_elapsed[joint] = 0.0
@@ -215,7 +215,7 @@ class Firmware:
         self._stiffness[joint] = stiffness
         self._damping[joint] = damping
         self._feedforward[joint] = feedforward
-        self._holding[joint] = False
+        self._held.discard(joint)
 
     def _move_target(self, joint: int, start: float, goal: float, velocity: float) -> None:
         self._target[joint] = start
@@ -241,6 +241,6 @@ class Firmware:
         return float(self._hold_final[joint]) + float(self._hold_offset[joint]) * max(0.0, remaining)
 
     def _advance_holding(self) -> None:
-        self._hold_elapsed[self._holding] += self._period_s
-        for joint in np.flatnonzero(self._holding).tolist():
+        for joint in self._held:
+            self._hold_elapsed[joint] += self._period_s
             self._move_target(joint, float(self._target[joint]), self._ramped(joint), 0.0)

@@ -63,7 +63,7 @@ def build(robot: Robot, config: PlantConfig, seed: int) -> PlantModel:
     _set_joints(spec, robot, config)
     factors = _perturb_masses(spec, config.mass_error, seed)
     _add_sensors(spec, robot)
-    _exclude_neighbours(spec)
+    _exclude_neighbours(spec, description.name)
     model = _compile(spec, description.name)
 
     joints = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in description.joint_names]
@@ -177,8 +177,8 @@ def sensor_name(name: str, kind: mujoco.mjtSensor) -> str:
     return f"{name}/{kind.name}"
 
 
-def _exclude_neighbours(spec: mujoco.MjSpec) -> None:
-    model = _compile(spec, "model")
+def _exclude_neighbours(spec: mujoco.MjSpec, name: str) -> None:
+    model = _compile(spec, name)
     weld = model.body_weldid
     parent = weld[model.body_parentid[weld]]
     solid = [body for body in range(1, model.nbody) if model.body_geomnum[body] > 0]

@@ -5,12 +5,8 @@ The order of a cycle is `deliver` (commands, then SYNC, on every bus) → `truth
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from operator import itemgetter
 from typing import Protocol
-
-from typing_extensions import Buffer
 
 from hal.profile import frames, objects
 from hal.profile.cia402 import SUPPORTED_MODES
@@ -100,11 +96,13 @@ class BusNodes:
         if self.waiting:
             answers = self.waiting + answers
             self.waiting = []
-        return b"".join(sorted(answers, key=_PRIORITY)) if len(answers) > 1 else b"".join(answers)
+        answers = sorted(answers, key=frame_identifier)
+        return b"".join(answers)
 
 
-_PRIORITY: Callable[[Buffer], tuple[int, int]] = itemgetter(1, 0)
-"""Sort key of a packed 11-bit frame: high byte, low byte of its identifier."""
+def frame_identifier(frame: bytes) -> int:
+    """Read the identifier of a packed 11-bit frame."""
+    return frame[1] << 8 | frame[0]
 
 
 class Plant:

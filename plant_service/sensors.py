@@ -52,6 +52,7 @@ class Sensors:
             for imu in self._imu_names
         ]
         self._quaternions = [_address(model, name, kinds.mjSENS_FRAMEQUAT) for name in self._imu_names]
+        self._noisy = any(value > 0.0 for value in noise.model_dump().values())
         self._generator = np.random.default_rng([seed, SENSOR_STREAM])
         self._wrench_noise = np.repeat([noise.force, noise.torque], 3)
         self._imu_noise = np.repeat([noise.angular_velocity, noise.acceleration], 3)
@@ -69,13 +70,15 @@ class Sensors:
             wrench = sensordata[address]
             fx, fy, fz, mx, my, mz = wrench.tolist()
             self.true_wrenches[name] = ((fx, fy, fz), (mx, my, mz))
-            self.wrenches[name] = wrench + bias + self._draw(self._wrench_noise)
+            self.wrenches[name] = wrench + (bias + self._draw(self._wrench_noise)) if self._noisy else wrench
         for name, address, quaternion in zip(self._imu_names, self._imus, self._quaternions, strict=True):
-            motion = sensordata[address] + self._draw(self._imu_noise)
+            motion = sensordata[address]
+            if self._noisy:
+                motion += self._draw(self._imu_noise)
             self.imus[name] = ImuReading(motion[:3], motion[3:], sensordata[quaternion])
 
     def _draw(self, deviation: Array) -> Array:
-        return deviation * self._generator.standard_normal(6) if deviation.any() else deviation
+        return deviation * self._generator.standard_normal(6)
 
 
 def _address(model: mujoco.MjModel, name: str, kind: mujoco.mjtSensor) -> NDArray[np.intp]:

@@ -10,13 +10,12 @@ from hal.bus.hub import BusHub
 from hal.bus.ports import FramePort, open_port
 from plant_service.plant import Plant
 from schemas.base import Clock
-from schemas.keys import Keys
 from schemas.lifecycle import Lifecycle, PeerLostError
 from schemas.load import Run
 from schemas.robot import Bus
 from schemas.service import ServiceOptions
 from schemas.statistics import CycleMeter
-from schemas.transport import TransportConfig, open_session
+from schemas.transport import open_service
 
 LOOK_UP_S: Final = 0.1
 """How often signals and peers are looked at while the bus is silent."""
@@ -122,16 +121,13 @@ def run_plant(run: Run, options: ServiceOptions) -> int:
         BusError: a bus cannot be hosted or opened.
 
     """
-    scenario, robot = run.scenario, run.robot.description
-    keys = Keys(scenario.namespace, robot.name)
-    buses = PortGroup([_open(bus) for bus in robot.buses])
+    buses = PortGroup([_open(bus) for bus in run.robot.description.buses])
     try:
-        transport = open_session("plant", keys, TransportConfig(base_port=options.base_port), scenario.clock)
-        with Lifecycle(transport, needed=("hal",)) as life:
+        with Lifecycle(open_service("plant", run, options), needed=("hal",)) as life:
             service = PlantService(run, buses, life)
-            transport.declare_publisher(keys.truth)
+            life.transport.declare_publisher(life.transport.keys.truth)
             life.join(options.peers)
-            if scenario.clock is Clock.LOCKSTEP:
+            if run.scenario.clock is Clock.LOCKSTEP:
                 service.lockstep()
             else:
                 service.realtime()

@@ -118,6 +118,9 @@ class Safety(Model):
     """Cycles without SYNC or RPDO after which a drive holds by its own means."""
     hold_ramp_s: PositiveFloat = 0.2
     """Time over which a held torque offset goes over into the position loop."""
+    holding: Literal["rule", "none"] = "rule"
+    """`none` sets a commanded change from torque to position to the bare commanded position: the naive switch, for
+    comparison in simulation only; the robot jumps. A safe stop follows the rule all the same."""
     heartbeat_s: PositiveFloat = 0.1
     """Producer heartbeat of every node and of the HAL; three missing are a loss."""
 

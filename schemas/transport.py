@@ -26,7 +26,7 @@ from typing import Annotated, Any, Final, Self
 
 import zenoh
 from pydantic import Field, PositiveInt
-from zenoh.handlers import Callback
+from zenoh.handlers import Callback, FifoChannel, Handler
 
 from schemas.base import Clock, Model
 from schemas.errors import CosimError
@@ -43,6 +43,11 @@ URGENT: Final = frozenset({"state", "command", "operator"})
 
 CONFIG_VARIABLE: Final = "COSIM_ZENOH_CONFIG"
 """Environment variable that names a Zenoh configuration for all services and observers of a run."""
+
+LOGGED_ONLY: Final = frozenset({"trace", "truth", "bus"})
+"""Topics that nobody waits for: they may travel together with what follows, which spares both ends a packet each."""
+
+BACKLOG: Final = 100_000
 
 WAIT_SLICE_S: Final = 0.1
 LAST_WORDS_S: Final = 0.05
@@ -113,9 +118,7 @@ class Subscription:
         sample = self._take(timeout_s)
         if sample is None:
             return None
-        attachment = sample.attachment
-        sequence, time_ns = _STAMP.unpack(attachment.to_bytes()) if attachment is not None else (0, 0)
-        return Sample(str(sample.key_expr)[self.root_length :], sample.payload.to_bytes(), sequence, time_ns)
+        return _unwrap(sample, self.root_length)
 
     def deliver(self, sample: zenoh.Sample | None) -> None:
         """Take in a sample (network thread); None only wakes the reader."""
@@ -138,6 +141,21 @@ class Subscription:
         self._fresh.acquire(timeout=timeout_s)
         sample, self._slot = self._slot, None
         return sample
+
+
+class Backlog:
+    """Messages of one key expression kept outside Python until they are taken, for a reader that is in no hurry."""
+
+    def __init__(self, subscriber: zenoh.Subscriber[Handler[zenoh.Sample]], root_length: int) -> None:
+        self._subscriber = subscriber
+        self._root_length = root_length
+
+    def take(self) -> list[Sample]:
+        """All that has arrived since the last call, oldest first; never waits."""
+        samples = []
+        while (sample := self._subscriber.try_recv()) is not None:
+            samples.append(_unwrap(sample, self._root_length))
+        return samples
 
 
 class Transport:
@@ -193,12 +211,12 @@ class Transport:
 
     def declare_publisher(self, key: str) -> zenoh.Publisher:
         """Declare a publisher ahead of the first message, so that the first cycle does not pay for it."""
-        urgent = key.removeprefix(self.keys.root + "/") in URGENT
+        topic = key.removeprefix(self.keys.root + "/").partition("/")[0]
         publisher = self._session.declare_publisher(
             key,
             encoding="application/json",
-            express=True,
-            priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA,
+            express=topic not in LOGGED_ONLY,
+            priority=zenoh.Priority.REAL_TIME if topic in URGENT else zenoh.Priority.DATA,
             congestion_control=self._congestion,
         )
         self._publishers[key] = publisher
@@ -213,6 +231,14 @@ class Transport:
         )
         self._subscriptions.append(subscription)
         return subscription
+
+    def subscribe_backlog(self, key: str) -> Backlog:
+        """Receive all that others publish on a key expression, taken in batches: less work a message than `subscribe`.
+
+        When `BACKLOG` messages wait, the network thread waits for the reader, and in lockstep the publishers in turn.
+        """
+        subscriber = self._session.declare_subscriber(key, FifoChannel(BACKLOG), allowed_origin=zenoh.Locality.REMOTE)
+        return Backlog(subscriber, len(self.keys.root) + 1)
 
     def announce(self) -> None:
         """Declare this service alive; call it once the subscriptions are declared."""
@@ -303,6 +329,12 @@ class Transport:
         if self._lost:
             for subscription in self._subscriptions:
                 subscription.deliver(None)
+
+
+def _unwrap(sample: zenoh.Sample, root_length: int) -> Sample:
+    attachment = sample.attachment
+    sequence, time_ns = _STAMP.unpack(attachment.to_bytes()) if attachment is not None else (0, 0)
+    return Sample(str(sample.key_expr)[root_length:], sample.payload.to_bytes(), sequence, time_ns)
 
 
 def open_service(service: str, run: Run, options: ServiceOptions) -> Transport:

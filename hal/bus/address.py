@@ -1,14 +1,16 @@
-"""Where virtual buses live: socket paths, and connecting to one."""
+"""Where virtual buses live: socket paths, hosting one and connecting to one."""
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import tempfile
 import time
 from pathlib import Path
+from stat import S_ISSOCK
 
-from hal.bus.errors import BusUnavailableError
+from hal.bus.errors import BusError, BusInUseError, BusUnavailableError
 
 PATH_LIMIT = 107
 """Bytes of `sun_path` in `struct sockaddr_un`, without the terminating zero."""
@@ -95,3 +97,54 @@ def connect(channel: str | os.PathLike[str], timeout_s: float) -> socket.socket:
             continue
         enlarge_buffers(client)
         return client
+
+
+def listen(address: Path) -> socket.socket:
+    """Host a virtual bus: bind its path for this user alone, replacing the file a killed host left; does not block.
+
+    Raises:
+        BusInUseError: another process serves it.
+        BusUnavailableError: the path cannot be bound, or is a file of another kind.
+
+    """
+    path = os.fspath(address)
+    listener = new_socket()
+    try:
+        _remove_stale(path)
+        listener.bind(path)
+        os.chmod(path, 0o600)
+        listener.listen(64)
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE:
+            raise BusInUseError(f"virtual bus {path} is served by another process") from error
+        raise BusUnavailableError(f"virtual bus {path} cannot be hosted: {error.strerror}") from error
+    except BusError:
+        listener.close()
+        raise
+    listener.setblocking(False)
+    return listener
+
+
+def _remove_stale(path: str) -> None:
+    """Remove the socket file a killed host left; refuse to touch a live host's or any other file."""
+    probe = new_socket()
+    probe.setblocking(False)
+    try:
+        probe.connect(path)
+    except FileNotFoundError:
+        return
+    except ConnectionRefusedError:
+        if not _is_socket(path):
+            raise BusUnavailableError(f"virtual bus {path}: a file that is no socket is in the way") from None
+        os.unlink(path)
+        return
+    except BlockingIOError:
+        pass
+    finally:
+        probe.close()
+    raise BusInUseError(f"virtual bus {path} is served by another process; stop it or choose another channel")
+
+
+def _is_socket(path: str) -> bool:
+    return S_ISSOCK(os.stat(path).st_mode)

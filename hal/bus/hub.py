@@ -6,18 +6,16 @@ other clients in the order in which it reads them, so that all nodes see one ord
 
 from __future__ import annotations
 
-import errno
 import os
 import select
 import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from stat import S_ISSOCK
 from threading import Thread
 
-from hal.bus.address import ECHO_OPTION, MAX_PACKET, enlarge_buffers, new_socket, socket_path
-from hal.bus.errors import BusError, BusInUseError, BusLostError, BusUnavailableError
+from hal.bus.address import ECHO_OPTION, MAX_PACKET, enlarge_buffers, listen, socket_path
+from hal.bus.errors import BusError, BusLostError
 from hal.profile.frames import FRAME_BYTES
 
 PACKETS_A_TURN = 64
@@ -51,7 +49,7 @@ class BusHub:
         self.name = name or os.fspath(channel)
         self.dropped_frames = 0
         self.malformed_packets = 0
-        self._listener = _listen(os.fspath(self.path))
+        self._listener = listen(self.path)
         self._inode = os.stat(self.path).st_ino
         self._epoll = select.epoll()
         self._epoll.register(self._listener, select.EPOLLIN)
@@ -286,49 +284,6 @@ def open_hubs(channels: Sequence[str | os.PathLike[str]]) -> tuple[BusHub, ...]:
             hub.close()
         raise
     return tuple(hubs)
-
-
-def _listen(path: str) -> socket.socket:
-    listener = new_socket()
-    try:
-        _remove_stale(path)
-        listener.bind(path)
-        os.chmod(path, 0o600)
-        listener.listen(64)
-    except OSError as error:
-        listener.close()
-        if error.errno == errno.EADDRINUSE:
-            raise BusInUseError(f"virtual bus {path} is served by another process") from error
-        raise BusUnavailableError(f"virtual bus {path} cannot be hosted: {error.strerror}") from error
-    except BusError:
-        listener.close()
-        raise
-    listener.setblocking(False)
-    return listener
-
-
-def _remove_stale(path: str) -> None:
-    """Remove the socket file a killed host left; refuse to touch a live host's or any other file."""
-    probe = new_socket()
-    probe.setblocking(False)
-    try:
-        probe.connect(path)
-    except FileNotFoundError:
-        return
-    except ConnectionRefusedError:
-        if not _is_socket(path):
-            raise BusUnavailableError(f"virtual bus {path}: a file that is no socket is in the way") from None
-        os.unlink(path)
-        return
-    except BlockingIOError:
-        pass
-    finally:
-        probe.close()
-    raise BusInUseError(f"virtual bus {path} is served by another process; stop it or choose another channel")
-
-
-def _is_socket(path: str) -> bool:
-    return S_ISSOCK(os.stat(path).st_mode)
 
 
 def _readable(connection: socket.socket) -> bool:

@@ -34,22 +34,28 @@ class CosimBus(can.BusABC):
 
     def __init__(
         self,
-        channel: str | os.PathLike[str],
+        channel: can.typechecking.Channel | os.PathLike[str],
         can_filters: can.typechecking.CanFilters | None = None,
         receive_own_messages: bool = False,
         connect_timeout: float = 2.0,
         **kwargs: object,
     ) -> None:
+        # python-can's command line turns a channel of digits into a number.
+        self.channel = os.fspath(channel) if isinstance(channel, os.PathLike) else str(channel)
         try:
-            self._socket = connect(channel, connect_timeout)
-            path = socket_path(channel)
+            self._socket = connect(self.channel, connect_timeout)
+            path = socket_path(self.channel)
         except BusError as error:
             raise can.CanInitializationError(str(error)) from error
-        self.channel = os.fspath(channel)
         self.channel_info = f"cosim channel '{path}'"
         self._can_protocol = can.CanProtocol.CAN_20
         self._waiting: deque[bytes] = deque()
         self._last_timestamp = 0.0
+        # A packet may hold several frames: while some wait here, this descriptor keeps `fileno` readable.
+        self._more = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._epoll = select.epoll()
+        self._epoll.register(self._socket, select.EPOLLIN)
+        self._epoll.register(self._more, select.EPOLLIN)
         if receive_own_messages:
             self._socket.send(ECHO_OPTION)
         super().__init__(channel=self.channel, can_filters=can_filters, **kwargs)
@@ -94,13 +100,20 @@ class CosimBus(can.BusABC):
             # The wall clock may step back; a trace's time stamps must not.
             self._last_timestamp = max(self._last_timestamp, time.time())
             self._waiting.extend(split(packet))
+            if len(self._waiting) > 1:
+                os.eventfd_write(self._more, 1)
+        elif len(self._waiting) == 1:
+            os.eventfd_read(self._more)
         return decode(self._waiting.popleft(), self._last_timestamp, self.channel), False
 
     def fileno(self) -> int:
-        """Descriptor that is readable when packets wait (several frames may come out of one)."""
-        return self._socket.fileno()
+        """Descriptor that is readable as long as a message waits."""
+        return self._epoll.fileno()
 
     def shutdown(self) -> None:
         """Leave the bus."""
-        super().shutdown()
-        self._socket.close()
+        if not self._is_shutdown:
+            super().shutdown()
+            self._epoll.close()
+            self._socket.close()
+            os.close(self._more)

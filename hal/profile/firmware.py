@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from hal.profile.units import Array, fixed
+from hal.profile.units import Array, bounded, fixed
 from schemas.robot import RobotDescription
 
 SMOOTHING = 0.05
@@ -56,7 +56,7 @@ class FirmwareGains:
 
 def dead_zone(x: Array, width: Array) -> Array:
     """D(x) = sign(x) max(|x| − d, 0)."""
-    result: Array = x - np.clip(x, -width, width)
+    result: Array = x - bounded(x, -width, width)
     return result
 
 
@@ -72,7 +72,7 @@ def inverse_dead_zone(torque: Array, width: Array, smoothing: float = 0.0) -> Ar
     """
     if smoothing > 0.0:
         band = np.maximum(smoothing * width, np.finfo(np.float64).tiny)
-        return torque + width * np.clip(torque / band, -1.0, 1.0)
+        return torque + width * bounded(torque / band, -1.0, 1.0)
     return torque + width * np.sign(torque)
 
 
@@ -81,7 +81,7 @@ def position_torque(
 ) -> Array:
     """Motor torque at the joint [N·m] of the firmware in its position modes (module's equation)."""
     effort = gains.position_gain * (target - position) + gains.velocity_gain * (target_velocity - velocity)
-    return np.clip(dead_zone(effort, gains.dead_zone), -gains.torque_limit, gains.torque_limit)
+    return bounded(dead_zone(effort, gains.dead_zone), -gains.torque_limit, gains.torque_limit)
 
 
 def holding_offset(torque: Array, velocity: Array, gains: FirmwareGains) -> Array:

@@ -54,8 +54,9 @@ def arm_urdf() -> str:
     parts.append(
         '<link name="hand"/><joint name="hand_mount" type="fixed"><parent link="link8"/><child link="hand"/>'
         '<origin xyz="0 0 -0.12"/></joint><link name="finger"><inertial><mass value="0.1"/><inertia ixx="1e-4"'
-        ' iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="a_finger" type="continuous"><parent'
-        ' link="hand"/><child link="finger"/><axis xyz="1 0 0"/></joint></robot>'
+        ' iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="a_finger" type="continuous"><parent link="hand"/><child link="finger"/>'
+        '<axis xyz="1 0 0"/></joint></robot>'
     )
     return "".join(parts)
 
@@ -119,8 +120,10 @@ class Plant:
     def __post_init__(self) -> None:
         description = self.run.robot.description
         self.rigid = RobotModel(self.run.robot)
-        for inertia, scale in zip(list(self.rigid.model.inertias)[1:], self.mass_scale or (), strict=False):
-            inertia.mass *= scale
+        if self.mass_scale is not None:
+            for i, scale in enumerate(self.mass_scale, start=1):
+                body = self.rigid.model.inertias[i]
+                self.rigid.model.inertias[i] = pin.Inertia(scale * body.mass, body.lever, scale * body.inertia)
         self.rigid.data = self.rigid.model.createData()
         self.gear = np.array([joint.gear_ratio for joint in description.joints])
         self.kp = np.array([joint.drive.position_gain for joint in description.joints])

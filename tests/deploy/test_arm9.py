@@ -1,4 +1,4 @@
-"""The arm9 description: inertials that follow from its primitives, a firmware that carries the arm, a bus plan that fits."""
+"""arm9: inertials that follow from its primitives, a firmware that carries the arm, a bus plan that fits."""
 
 from __future__ import annotations
 

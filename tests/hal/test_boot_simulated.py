@@ -31,7 +31,7 @@ class StandingAxis:
     def __init__(self, counts: int) -> None:
         self.counts = counts
         self.gains: list[AxisGains] = []
-        self.followed: list[tuple[int, int]] = []
+        self.holds = 0
 
     def position_counts(self) -> int:
         return self.counts
@@ -42,12 +42,13 @@ class StandingAxis:
     def power_off(self) -> None: ...
 
     def follow_position(self, target_counts: int, max_torque_per_mille: int) -> None:
-        self.followed.append((target_counts, max_torque_per_mille))
+        raise AssertionError("the boot commands no position, the drive holds by itself")
 
     def follow_torque(self, per_mille: int, max_torque_per_mille: int) -> None:
         raise AssertionError("the boot commands no torque")
 
-    def hold(self) -> None: ...
+    def hold(self) -> None:
+        self.holds += 1
 
     def configure(self, gains: AxisGains) -> None:
         self.gains.append(gains)
@@ -121,13 +122,17 @@ def test_all_kinds_are_enabled_and_hold(plant: Plant) -> None:
     for devices in plant.devices:
         assert [device.state for device in devices] == [DriveState.OPERATION_ENABLED] * 3
     for axis in plant.axes:
-        assert axis.followed[-1] == (axis.counts, 1200)
+        assert axis.holds == 1
         assert {gains.position_gain for gains in axis.gains} >= {2000.0}
         assert {gains.velocity_gain for gains in axis.gains} >= {20.0}
         assert {gains.hold_ramp_s for gains in axis.gains} >= {0.2}
         assert {gains.rated_motor_torque for gains in axis.gains} >= {0.5}
     for devices in plant.devices:
-        assert {device.dictionary.values[key_of(objects.WATCHDOG_CYCLES)] for device in devices} == {5}
+        for device in devices:
+            values = device.dictionary.values
+            assert values[key_of(objects.WATCHDOG_CYCLES)] == 5
+            assert values[key_of(objects.MAX_TORQUE)] == 1200
+            assert values[key_of(objects.TARGET_POSITION)] == values[key_of(objects.POSITION_ACTUAL)]
 
 
 def test_no_sync_is_sent_and_boots_are_alike(plant: Plant) -> None:

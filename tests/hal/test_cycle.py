@@ -46,7 +46,9 @@ class Loop:
         per_mille = self.units.per_mille_from_torque(self.torque)
         for index, joint in enumerate(self.robot.joints):
             node = joint.drive.node_id
-            part = b"" if index in self.silent else report(node, counts[index], per_mille[index], self.statusword[index])
+            part = (
+                b"" if index in self.silent else report(node, counts[index], per_mille[index], self.statusword[index])
+            )
             mode = self.modes[index]
             if self.sent and 0x300 + node in self.sent[-1]:
                 mode = 10
@@ -385,6 +387,38 @@ def test_expected_reports_include_mode_changes_and_sensors() -> None:
         loop.cycle(T, torque=(1.0, 1.0))
     assert loop.core.expected_reports == (frozenset({0x181}), frozenset({0x182}))
     assert len(loop.events("sensor_silent")) == 1
+
+
+def test_a_sensor_that_comes_back_is_told_and_awaited_again() -> None:
+    loop = Loop("torque", force_torque_sensors=(wrist(),))
+    for _ in range(6):
+        loop.cycle()
+    assert loop.core.expected_reports[1] == frozenset()
+    loop.extra[1] = frame(0x50, bytes.fromhex("0b0032ffce01f403")) + frame(0x51, bytes(8))
+    assert loop.cycle().wrenches[0].age_cycles == 0
+    assert [event.severity for event in loop.events("sensor_back")] == ["info"]
+    assert loop.core.expected_reports[1] == frozenset({0x50, 0x51})
+
+
+def test_a_stopped_servo_keeps_its_last_target_and_limit() -> None:
+    loop = Loop("servo")
+    loop.cycle(S, position=(0.004,), torque_limit=(7.0,))
+    loop.sync()
+    last = loop.sent[-1][0x201]
+    loop.core.stop("test")
+    assert loop.answer(None)[0x201] == last
+    applied = loop.sync().applied
+    assert (applied.sequence, applied.mode, applied.torque_limit) == (-1, S, (7.0,))
+
+
+def test_emergencies_and_resets_of_a_node_stop_the_robot() -> None:
+    for foreign in (frame(0x082, struct.pack("<HB5s", 0x8250, 0x11, b"")), frame(0x702, b"\0")):
+        loop = Loop()
+        loop.cycle(P, position=(0.0, 0.0))
+        loop.extra[1] = foreign
+        assert loop.cycle(P, position=(0.0, 0.0)).status is HalStatus.SAFE_STOP
+        assert isinstance(loop.core.cause, DriveFaultError)
+        assert loop.core.cause.joint == "j1"
 
 
 def test_misuse_is_refused() -> None:

@@ -22,7 +22,11 @@ def test_state_reports_in_any_order_on_both_buses() -> None:
     )
     assert measured.position == pytest.approx([2 * np.pi / 100, 0.1 + 2 * np.pi, 0.2 + 2 * np.pi])
     assert measured.motor_torque == pytest.approx([0.0, -5.0, -50.0])
-    assert measured.drive_state.tolist() == [DriveState.OPERATION_ENABLED, DriveState.FAULT, DriveState.OPERATION_ENABLED]
+    assert measured.drive_state.tolist() == [
+        DriveState.OPERATION_ENABLED,
+        DriveState.FAULT,
+        DriveState.OPERATION_ENABLED,
+    ]
     assert measured.silent_cycles.tolist() == [0, 0, 0]
 
 

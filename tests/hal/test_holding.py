@@ -33,7 +33,9 @@ def test_at_rest_the_prediction_is_the_position_itself() -> None:
 @pytest.mark.parametrize("torque", [-80.0, -2.0, 0.5, 30.0])
 @pytest.mark.parametrize("velocity", [0.0, 0.4])
 @pytest.mark.parametrize("direction", [1, -1])
-def test_the_first_position_torque_is_the_last_torque_mode_torque(torque: float, velocity: float, direction: int) -> None:
+def test_the_first_position_torque_is_the_last_torque_mode_torque(
+    torque: float, velocity: float, direction: int
+) -> None:
     description = robot("torque", joint={"direction": direction})
     rule, gains = HoldingRule(description), FirmwareGains.of(description)
     target = rule.target(np.array([torque]), np.array([0.2]), np.array([velocity]))
@@ -49,7 +51,9 @@ def test_a_wrong_dead_zone_makes_no_step_either() -> None:
     effort = rule.effort(np.array([20.0]))
     delivered = effort - 3.0
     target = rule.target(np.array([20.0]), np.array([0.0]), np.array([0.0]))
-    assert position_torque(target, np.zeros(1), np.zeros(1), np.zeros(1), true)[0] == pytest.approx(delivered[0], abs=1e-9)
+    assert position_torque(target, np.zeros(1), np.zeros(1), np.zeros(1), true)[0] == pytest.approx(
+        delivered[0], abs=1e-9
+    )
 
 
 def test_a_hold_ramps_linearly_to_nothing() -> None:

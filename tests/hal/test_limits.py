@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.limits import Limits, Onsets
@@ -33,6 +33,7 @@ def test_torque_and_its_rate() -> None:
     assert acted(limited.acted) == {"torque limit": [True, False], "torque rate limit": [False, True]}
 
 
+@settings(deadline=None)
 @given(number, number)
 def test_no_command_passes_the_limits(commanded: float, previous: float) -> None:
     held = float(np.clip(previous, -2.0, 2.0))

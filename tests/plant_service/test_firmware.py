@@ -246,5 +246,5 @@ def test_parameters_can_be_set() -> None:
     "gains", [AxisGains(position_gain=0.0), AxisGains(velocity_gain=-1.0), AxisGains(rated_motor_torque=-0.1)]
 )
 def test_senseless_parameters_are_refused(gains: AxisGains) -> None:
-    with pytest.raises(PlantError, match="scapula_roll: .* is not above zero"):
+    with pytest.raises(PlantError, match=r"scapula_roll: .* is not above zero"):
         Bench().axes[1].configure(gains)

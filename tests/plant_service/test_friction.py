@@ -16,6 +16,7 @@ from schemas.scenario import Friction, PlantConfig
 TABLE = Friction()
 N = 250.0
 STATES = ()
+EXACT = PlantConfig(torque_scale=1.0, mass_error=0.0)
 WHEEL_URDF = """<robot name="wheel"><link name="base"/>
 <joint name="hinge" type="continuous"><parent link="base"/><child link="wheel"/><axis xyz="0 0 1"/></joint>
 <link name="wheel"><inertial><mass value="1"/>
@@ -57,7 +58,7 @@ def wheel() -> Robot:
     return Robot(description, WHEEL_URDF)
 
 
-def pushed_wheel(torque: float, config: PlantConfig = PlantConfig(torque_scale=1.0, mass_error=0.0)) -> Simulation:
+def pushed_wheel(torque: float, config: PlantConfig = EXACT) -> Simulation:
     """The wheel in torque mode under a constant torque [N·m]."""
     simulation = Simulation(wheel(), config, 0)
     simulation.axes[0].follow_torque(round(10.0 * torque), 3000)

@@ -1,4 +1,4 @@
-"""The power state machine against the standard's diagram, written out here by hand; what the axis does in each state."""
+"""The power state machine against the standard's diagram, written by hand; what the axis does in each state."""
 
 from __future__ import annotations
 

@@ -23,6 +23,11 @@ POSE = {"scapula_roll": -0.3, "shoulder_pitch": -0.8, "shoulder_roll": -0.6, "el
 SLIPPERY = Friction(coulomb=0.0, breakaway=0.0, viscous=0.0)
 
 
+def advance(simulation: Simulation, periods: int) -> None:
+    for _ in range(periods):
+        simulation.advance()
+
+
 def gravity_torque(q: Vector) -> np.ndarray:
     model = pin.buildModelFromXML(ROBOT.urdf)
     return pin.rnea(model, model.createData(), np.array(q), np.zeros(9), np.zeros(9))
@@ -47,18 +52,19 @@ def test_brakes_carry_what_pinocchio_says() -> None:
 
 
 def test_motors_carry_what_pinocchio_says_and_report_more() -> None:
-    """Without friction the true motor torque is gravity's; the drive believes it gives 1 / torque_scale times as much."""
+    """Without friction the true motor torque is gravity's; the drive reports 1 / torque_scale times as much."""
     config = PlantConfig(initial_posture=POSE, mass_error=0.0, friction=SLIPPERY, torque_scale=0.9)
     simulation = Simulation(ROBOT, config, 0)
     hold_positions(simulation, 2.0)
     truth = simulation.truth(0, STATES)
     gravity = gravity_torque(truth.position)
-    assert truth.motor_torque == pytest.approx(gravity, abs=0.1)
+    # One count of the encoder is up to 0.2 N·m.
+    assert truth.motor_torque == pytest.approx(gravity, abs=0.3)
     reported = [
         axis.torque_per_mille() * joint.drive.rated_motor_torque * joint.gear_ratio / 1000.0
         for axis, joint in zip(simulation.axes, JOINTS, strict=True)
     ]
-    assert reported == pytest.approx(gravity / 0.9, abs=0.2)
+    assert reported == pytest.approx(gravity / 0.9, abs=0.4)
 
 
 def test_sag_under_the_position_loop_is_small() -> None:
@@ -217,7 +223,6 @@ def test_divergence_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     robot = Robot(ROBOT.description.model_copy(update={"joints": (wild, *JOINTS[1:])}), ROBOT.urdf)
     simulation = Simulation(robot, PlantConfig(), 0)
     simulation.axes[0].follow_position(simulation.axes[0].position_counts() + 1000, 2**1000)
-    with pytest.raises(DivergedError, match="velocity .* rad/s at .*BADQ"):
-        for _ in range(200):
-            simulation.advance()
+    with pytest.raises(DivergedError, match=r"velocity .* rad/s at .*BADQ"):
+        advance(simulation, 200)
     assert not list(tmp_path.iterdir())

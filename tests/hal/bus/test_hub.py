@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import os
 import signal
@@ -232,6 +233,19 @@ class TestClient:
             with pytest.raises(can.CanOperationError, match="no room"):
                 fill(lambda: bus.send(message, timeout=0.01))
             bus.shutdown()
+
+    def test_a_packet_of_several_frames_wakes_an_asynchronous_reader_for_each(self, path: str) -> None:
+        async def listen(hub: BusHub, bus: can.BusABC) -> list[int]:
+            reader = can.AsyncBufferedReader()
+            notifier = can.Notifier(bus, [reader], loop=asyncio.get_running_loop())
+            hub.send(numbered(1, 2, 3, 4, 5))
+            received = [await asyncio.wait_for(reader.get_message(), WAIT_S) for _ in range(5)]
+            notifier.stop()
+            return [frame.arbitration_id for frame in received]
+
+        with BusHub(path) as hub, can.Bus(interface="cosim", channel=path) as bus:
+            assert hub.receive(0.0) == b""
+            assert asyncio.run(listen(hub, bus)) == [1, 2, 3, 4, 5]
 
     def test_can_fd_is_refused(self, path: str) -> None:
         with serve_in_thread(path):

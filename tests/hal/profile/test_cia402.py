@@ -57,7 +57,10 @@ def test_vectorised_decoding_agrees_and_names_the_undefined() -> None:
 
 @pytest.mark.parametrize("state", S)
 def test_encoding_is_decoded_back_whatever_the_other_bits(state: S) -> None:
-    assert decode_state(encode_statusword(state, StatusBit.VOLTAGE_ENABLED | StatusBit.REMOTE | StatusBit.WARNING)) is state
+    assert (
+        decode_state(encode_statusword(state, StatusBit.VOLTAGE_ENABLED | StatusBit.REMOTE | StatusBit.WARNING))
+        is state
+    )
     assert set(STATUSWORD_OF_STATE) == set(S)
 
 

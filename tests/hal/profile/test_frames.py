@@ -17,7 +17,11 @@ def test_unpack_yields_identifier_and_data() -> None:
 def test_view_reads_the_same_fields() -> None:
     frames = view(GOLDEN)
     assert FRAME.itemsize == 16
-    assert (frames["can_id"][0], frames["length"][0], frames["data"][0].tobytes()) == (0x182, 3, b"\xaa\xbb\xcc" + b"\0" * 5)
+    assert (frames["can_id"][0], frames["length"][0], frames["data"][0].tobytes()) == (
+        0x182,
+        3,
+        b"\xaa\xbb\xcc" + b"\0" * 5,
+    )
 
 
 def test_too_much_data_and_broken_buffers_are_refused() -> None:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.profile.units import DriveUnits
@@ -36,6 +36,7 @@ def test_numbers_beyond_the_bus_saturate() -> None:
     assert UNITS.per_mille_from_limit(np.array([1e9, -1.0])).tolist() == [65535, 0]
 
 
+@settings(deadline=None)
 @given(st.integers(-(2**30), 2**30), st.integers(-32767, 32767))
 def test_round_trips_are_exact(counts: int, per_mille: int) -> None:
     both = np.array([counts, counts])

@@ -1,0 +1,65 @@
+"""Limits as rows: torque with the integral term, speed, range, always lower ≤ upper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from controller_service.constraints import JointLimits
+from controller_service.model import Configuration, RobotModel
+from schemas.load import Robot
+
+
+@pytest.fixture(scope="module")
+def limits(arm: Robot) -> JointLimits:
+    return JointLimits(arm.description, 0.05)
+
+
+def at(arm: Robot, q: float, v: float) -> Configuration:
+    return RobotModel(arm).configure(np.full(9, q), np.full(9, v))
+
+
+def test_torque_rows_hold_exactly_when_the_whole_torque_is_within_its_limit(arm: Robot, limits: JointLimits) -> None:
+    now = at(arm, 0.3, 0.4)
+    integral = np.linspace(-40.0, 40.0, 9)
+    rows = limits.rows(now, integral)
+    for torque in (limits.torque, -limits.torque):
+        acceleration = np.linalg.solve(now.mass, torque - now.nonlinear - integral)
+        reached = (rows.A @ acceleration)[9:]
+        edge = rows.upper[9:] if torque[0] > 0 else rows.lower[9:]
+        assert np.allclose(reached, edge)
+    bare = rows.without_kinematics()
+    assert np.isinf(bare.lower[:9]).all()
+    assert np.isinf(bare.upper[:9]).all()
+    assert np.array_equal(bare.upper[9:], rows.upper[9:])
+
+
+@pytest.mark.parametrize("q", [-4.0, -2.6, -2.499, -1.0, 0.0, 2.49, 2.5, 2.51, 9.0])
+@pytest.mark.parametrize("v", [-5.0, -1.0, 0.0, 3.0, 8.0])
+def test_bounds_never_cross(arm: Robot, limits: JointLimits, q: float, v: float) -> None:
+    lower, upper = limits.acceleration_bounds(at(arm, q, v))
+    assert (lower <= upper).all()
+    if q > 2.5 and v == 0.0:
+        assert (upper < 0.0).all()
+    if q < -2.5 and v == 0.0:
+        assert (lower > 0.0).all()
+
+
+def test_a_joint_pushed_as_hard_as_allowed_stops_at_its_range_and_keeps_its_speed(
+    arm: Robot, limits: JointLimits
+) -> None:
+    """Every joint alone with gravity balanced, at the upper bound of its acceleration for two seconds."""
+    period = arm.description.period_s
+    model = RobotModel(arm)
+    q, v = np.zeros(9), np.zeros(9)
+    deceleration = np.zeros(9)
+    for _ in range(1000):
+        now = model.configure(q, v)
+        upper = limits.acceleration_bounds(now)[1]
+        a = np.minimum(upper, 20.0)
+        deceleration = np.minimum(deceleration, a)
+        q, v = q + period * v + 0.5 * period**2 * a, v + period * a
+        assert (q <= 2.5 + 1e-4).all()
+        assert (np.abs(v) <= 3.0 + 1e-9).all()
+    assert (q > 2.45).all()
+    assert (-deceleration * now.mass.diagonal() < limits.torque).all()

@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from schemas.load import Run, load_run
+
+ARM9 = Path(__file__).parents[2] / "deploy" / "robots" / "arm9"
+
+
+@pytest.fixture
+def run() -> Run:
+    return load_run("arm9-transition", {"duration_s": 1.0})
+
+
+@pytest.fixture
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run directory of the test's own."""
+    monkeypatch.setenv("COSIM_RUN_DIR", str(tmp_path / "run"))
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def robot_file(tmp_path: Path) -> Path:
+    """A copy of arm9 that may be spoiled."""
+    return Path(shutil.copytree(ARM9, tmp_path / "arm9")) / "arm9.yaml"
