@@ -73,7 +73,7 @@ class InProcess:
 
     def finish(self) -> None:
         """Leave the robot holding."""
-        self.master.core.stop("end of the run")
+        self.master.core.leave()
         for _ in range(self._run.robot.description.command_delay_cycles + 1):
             self._exchange()
             self._advance()

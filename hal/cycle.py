@@ -170,6 +170,11 @@ class HalCore:
             self._safe_stop = True
             self._tell("safe_stop", "error", f"safe stop: {reason}; the HAL holds until the run ends")
 
+    def leave(self) -> None:
+        """Hold from the next `apply` on because the run is over: as a safe stop, but nothing is wrong."""
+        self._safe_stop = True
+        self._tell("run_end", "info", "the run is over; the HAL holds and leaves")
+
     def reset(self) -> None:
         """Clear a latched emergency stop; a safe stop stays."""
         if not self._emergency_stop:

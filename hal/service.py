@@ -79,7 +79,7 @@ class HalService:
             raise
         finished = core.status is HalStatus.ACTIVE
         if finished:
-            core.stop("end of the run")
+            core.leave()
         self._hold(self._robot.command_delay_cycles + 1 if finished else self._ramp_cycles)
         if not finished and life.signalled is None:
             raise SafeStopError(f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from hal.errors import HalError
+from hal.profile.firmware import ramp_share
 from hal.profile.units import Array
 from schemas.base import ControlMode, Vector
 from schemas.messages import AppliedCommand
@@ -16,7 +17,7 @@ HAL_DECIDED: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """An offset [rad] that holds a torque in the position modes and ramps to zero, linearly in cycles."""
+    """An offset [rad] that holds a torque in the position modes and ramps to zero by `ramp_share`, over a number of cycles."""
 
     entry: Array
     cycles: int
@@ -24,8 +25,8 @@ class Hold:
 
     @property
     def offset(self) -> Array:
-        """`entry · left / cycles` [rad]."""
-        return self.entry * (self.left / self.cycles)
+        """What is left of `entry` [rad]."""
+        return self.entry * ramp_share(self.left / self.cycles)
 
     def advanced(self) -> Hold | None:
         """Return the next cycle's; None when nothing is left."""

@@ -57,6 +57,7 @@ GAIN_FIELDS: Final = {
     key_of(objects.POSITION_GAIN): ("position_gain", 1e-3),
     key_of(objects.VELOCITY_GAIN): ("velocity_gain", 1e-3),
     key_of(objects.HOLD_RAMP_MS): ("hold_ramp_s", 1e-3),
+    key_of(objects.JOINT_TORQUE_LIMIT): ("torque_limit", 1e-3),
     key_of(objects.RATED_TORQUE_MNM): ("rated_motor_torque", 1e-3),
 }
 """Firmware parameters: object → field of `AxisGains` and its unit in SI."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.profile.cia402 import OperationMode
-from hal.profile.firmware import FirmwareGains, holding_offset
+from hal.profile.firmware import FirmwareGains, holding_offset, ramp_share
 from hal.profile.units import DriveUnits
 from plant_service.axis import AxisGains
 from plant_service.errors import PlantError
@@ -238,7 +238,7 @@ class Firmware:
     def _ramped(self, joint: int) -> float:
         """Target one period from now."""
         remaining = 1.0 - (float(self._hold_elapsed[joint]) + self._period_s) / float(self._hold_ramp_s[joint])
-        return float(self._hold_final[joint]) + float(self._hold_offset[joint]) * max(0.0, remaining)
+        return float(self._hold_final[joint]) + float(self._hold_offset[joint]) * ramp_share(remaining)
 
     def _advance_holding(self) -> None:
         for joint in self._held:

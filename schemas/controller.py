@@ -46,7 +46,7 @@ class QpConfig(Model):
     """The quadratic program (5)."""
 
     solver: Literal["osqp", "daqp"] = "osqp"
-    iterations: PositiveInt = 200
+    iterations: PositiveInt = 500
     """Upper bound on the solver's iterations a tick."""
     tolerance: PositiveFloat = 1e-6
     regularization: PositiveFloat = 1e-6
@@ -68,6 +68,6 @@ class ControllerConfig(Model):
     velocity_cutoff_hz: PositiveFloat = 60.0
     """First-order low-pass on the differentiated positions."""
     posture: TaskGains = TaskGains(stiffness=25.0, damping=10.0, weight=1.0)
-    hand: TaskGains = TaskGains(stiffness=400.0, damping=40.0, weight=1000.0)
+    hand: TaskGains = TaskGains(stiffness=900.0, damping=60.0, weight=1000.0)
     qp: QpConfig = QpConfig()
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)]

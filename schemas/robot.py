@@ -75,6 +75,11 @@ class Joint(Model):
         counts *= self.gear_ratio * self.encoder_counts / 6.283185307179586
         if counts >= 2**31:
             raise ValueError(f"the position range needs {counts:.3g} encoder counts, more than the bus's 32 bits hold")
+        millinewtons = 1000.0 * self.drive.rated_motor_torque
+        if abs(millinewtons - round(millinewtons)) > 1e-6:
+            raise ValueError(
+                f"rated_motor_torque {self.drive.rated_motor_torque} must be whole mN·m, as the bus holds it"
+            )
         per_mille = 1000.0 * self.torque_limit / (self.drive.rated_motor_torque * self.gear_ratio)
         if per_mille > 32767:
             raise ValueError(f"torque_limit is {per_mille:.0f} ‰ of the rated torque, more than the bus's 16 bits hold")

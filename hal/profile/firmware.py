@@ -87,3 +87,13 @@ def position_torque(
 def holding_offset(torque: Array, velocity: Array, gains: FirmwareGains) -> Array:
     """(D⁻¹(τ) + k_d q̇) / k_p [rad]: from the position to the target at which the firmware gives τ, with q̇_t = 0."""
     return (inverse_dead_zone(torque, gains.dead_zone) + gains.velocity_gain * velocity) / gains.position_gain
+
+
+def ramp_share(remaining: float) -> float:
+    """Share of a holding offset that is left when a share `remaining` of its ramp's time is left: r² (3 − 2r).
+
+    It starts and ends without slope: the position loop's damping answers a target's slope with torque, and a linear
+    ramp would put that into one cycle.
+    """
+    bounded_remaining = min(max(remaining, 0.0), 1.0)
+    return bounded_remaining**2 * (3.0 - 2.0 * bounded_remaining)

@@ -56,13 +56,18 @@ def test_a_wrong_dead_zone_makes_no_step_either() -> None:
     )
 
 
-def test_a_hold_ramps_linearly_to_nothing() -> None:
-    hold: Hold | None = Hold(np.array([4.0]), 4, 4)
+def test_a_hold_ramps_to_nothing_and_starts_and_ends_without_slope() -> None:
+    hold: Hold | None = Hold(np.array([4.0]), 100, 100)
     offsets = []
     while hold is not None:
         offsets.append(float(hold.offset[0]))
         hold = hold.advanced()
-    assert offsets == [4.0, 3.0, 2.0, 1.0]
+    steps = -np.diff([*offsets, 0.0])
+    assert offsets[0] == 4.0
+    assert len(offsets) == 100
+    assert (steps > 0.0).all()
+    assert offsets[50] == pytest.approx(2.0)
+    assert max(steps[0], steps[-1]) < 0.05 * steps[50]
 
 
 def test_the_ramp_lasts_hold_ramp_s() -> None:
