@@ -9,6 +9,13 @@ from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 from schemas.base import Model, Vector3
 
 NodeId = Annotated[int, Field(ge=1, le=127)]
+RESERVED_IDENTIFIERS = (0x000, 0x080, 0x77F)
+"""NMT, SYNC and the heartbeat of the HAL, node 127."""
+NODE_IDENTIFIERS = (0x080, 0x180, 0x280, 0x200, 0x300, 0x580, 0x600, 0x700)
+"""Bases of a drive's EMCY, PDOs, SDOs and heartbeat."""
+IMU_IDENTIFIERS = (0x21, 0x32, 0x34)
+"""The maker's, of quaternion, gyro and acceleration."""
+
 NonNegative = Annotated[float, Field(ge=0.0)]
 
 
@@ -187,11 +194,26 @@ class RobotDescription(Model):
             if channel not in names:
                 raise ValueError(f"{user}: unknown bus {channel!r}; the buses are {', '.join(sorted(names))}")
         for bus in self.buses:
-            owners: dict[int, str] = {}
-            for joint in self.joints:
-                if joint.drive.bus == bus.name:
-                    _claim(owners, joint.drive.node_id, joint.name, f"node id on bus {bus.name}")
+            self._check_identifiers(bus.name)
         return self
+
+    def _check_identifiers(self, bus: str) -> None:
+        """Refuse two users of one node id or CAN identifier: nobody could tell their frames apart."""
+        nodes: dict[int, str] = {}
+        identifiers = dict.fromkeys(RESERVED_IDENTIFIERS, "CANopen itself")
+        for joint in self.joints:
+            if joint.drive.bus == bus:
+                _claim(nodes, joint.drive.node_id, joint.name, f"node id on bus {bus}")
+                for base in NODE_IDENTIFIERS:
+                    _claim(identifiers, base + joint.drive.node_id, joint.name, f"CAN identifier on bus {bus}")
+        for sensor in self.force_torque_sensors:
+            if sensor.bus == bus:
+                for identifier in (sensor.can_id, sensor.can_id + 1, sensor.command_id):
+                    _claim(identifiers, identifier, sensor.name, f"CAN identifier on bus {bus}")
+        for imu in self.imus:
+            if imu.bus == bus:
+                for offset in IMU_IDENTIFIERS:
+                    _claim(identifiers, imu.base_id + offset, imu.name, f"CAN identifier on bus {bus}")
 
 
 def _refuse_twice(what: str, names: list[str]) -> None:
