@@ -1,17 +1,21 @@
-"""`python -m benchmarks`: measure every stage of the cycle and the whole, print a table, write JSON."""
+"""`python -m benchmarks`: measure the machine, every stage of the cycle and the whole; print tables, write JSON."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.measure import Figures
 from benchmarks.stages import bus_round_trip, one_process, separate_processes, zenoh_round_trip
+from benchmarks.yardstick import yardsticks
 from schemas.load import load_run
 
 
@@ -19,46 +23,55 @@ def main() -> int:
     """Run all benchmarks."""
     parser = argparse.ArgumentParser(prog="benchmarks", description=__doc__)
     parser.add_argument("--scenario", default="arm9-transition")
-    parser.add_argument("--cycles", type=int, default=2000, help="cycles in one process, and round trips")
-    parser.add_argument("--duration", type=float, default=5.0, help="simulated seconds as separate processes")
+    parser.add_argument("--cycles", type=int, default=4000, help="cycles in one process, and round trips")
+    parser.add_argument("--duration", type=float, default=10.0, help="simulated seconds as separate processes")
     parser.add_argument("--out", type=Path, default=Path("runs/bench.json"))
     chosen = parser.parse_args()
     console = Console(stderr=True)
 
+    with console.status("machine"):
+        machine = [timing.figures() for timing in yardsticks(chosen.cycles)]
     with console.status("one process"):
-        timings, factor = one_process(load_run(chosen.scenario), chosen.cycles)
+        one = one_process(load_run(chosen.scenario), chosen.cycles)
+    stages = list(one.stages)
     with console.status("bus"):
-        timings.append(bus_round_trip(chosen.cycles))
+        stages.append(bus_round_trip(chosen.cycles).figures())
     with console.status("Zenoh"):
-        timings.append(zenoh_round_trip(chosen.cycles))
+        stages.append(zenoh_round_trip(chosen.cycles).figures())
     with console.status("separate processes"):
-        processes = separate_processes(chosen.scenario, chosen.duration)
+        separate = separate_processes(chosen.scenario, chosen.duration)
 
-    table = Table(title=f"{chosen.scenario}, wall clock", title_justify="left")
-    table.add_column("stage")
-    for header in ("median µs", "p99 µs", "p99.9 µs"):
-        table.add_column(header, justify="right")
-    for timing in timings:
-        table.add_row(timing.name, *(f"{timing.percentile(q) * 1e6:.0f}" for q in (50.0, 99.0, 99.9)))
-    Console(width=None if sys.stdout.isatty() else 100).print(table)
-    median_us = processes["cycle_time_median_s"] * 1e6
-    print(f"real-time factor: one process {factor:.2f}, separate processes {processes['real_time_factor']:.2f}")
-    print(f"whole cycle, separate processes: median {median_us:.0f} µs")
+    out = Console(width=None if sys.stdout.isatty() else 100)
+    out.print(_table("this machine, now", machine))
+    out.print(_table(f"{chosen.scenario}: stages of the cycle, wall clock", stages))
+    out.print(_table("separate processes, of each service's own cycle", separate.stages))
+    out.print(_table("whole cycle, SYNC to SYNC", [one.whole, separate.whole]))
+    print(f"real-time factor: one process {one.real_time_factor:.2f}, separate {separate.real_time_factor:.2f}")
 
     result = {
         "scenario": chosen.scenario,
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "stages": [timing.as_json() for timing in timings],
-        "one_process": {"real_time_factor": factor},
-        "separate_processes": {
-            key: processes[key] for key in ("cycle_time_median_s", "cycle_time_max_s", "real_time_factor")
-        },
+        "processors": os.cpu_count(),
+        "yardsticks": [each.as_json() for each in machine],
+        "stages": [each.as_json() for each in stages],
+        "one_process": one.as_json(),
+        "separate_processes": separate.as_json(),
     }
     chosen.out.parent.mkdir(parents=True, exist_ok=True)
-    chosen.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    chosen.out.write_text(json.dumps(result, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     print(chosen.out)
     return 0
+
+
+def _table(title: str, rows: Sequence[Figures]) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("what", min_width=34)
+    for header in ("median µs", "p99 µs", "p99.9 µs"):
+        table.add_column(header, justify="right")
+    for row in rows:
+        table.add_row(row.name, *(f"{time_s * 1e6:.0f}" for time_s in (row.median_s, row.p99_s, row.p99_9_s)))
+    return table
 
 
 if __name__ == "__main__":

@@ -4,11 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What is reported of one stage [s]."""
+
+    name: str
+    count: int
+    median_s: float
+    p99_s: float
+    p99_9_s: float
+
+    def as_json(self) -> dict[str, float | int | str]:
+        """Plain values."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,19 +33,10 @@ class Timing:
     name: str
     samples: npt.NDArray[np.float64]
 
-    def percentile(self, q: float) -> float:
-        """Percentile [s]; 50 is the median."""
-        return float(np.percentile(self.samples, q))
-
-    def as_json(self) -> dict[str, float | int | str]:
-        """Plain values."""
-        return {
-            "name": self.name,
-            "count": len(self.samples),
-            "median_s": self.percentile(50.0),
-            "p99_s": self.percentile(99.0),
-            "p99_9_s": self.percentile(99.9),
-        }
+    def figures(self) -> Figures:
+        """Sum up."""
+        median, p99, p99_9 = np.percentile(self.samples, (50.0, 99.0, 99.9)).tolist()
+        return Figures(self.name, len(self.samples), median, p99, p99_9)
 
 
 def measure(name: str, call: Callable[[], object], n: int, warm_up: int = 20) -> Timing:

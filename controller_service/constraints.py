@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller_service.model import Array, Configuration
 from schemas.robot import RobotDescription
@@ -63,6 +64,8 @@ class JointLimits:
         self.speed = np.array([joint.velocity_limit for joint in joints])
         self.position_min = np.array([joint.position_min for joint in joints])
         self.position_max = np.array([joint.position_max for joint in joints])
+        self._torque_sides = np.stack((-self.torque, self.torque))
+        self._braking_floor = BRAKING_FLOOR * self.torque
         self._damper = damper_s
         self._response = max(description.period_s, RESPONSE_SHARE * damper_s)
         self._n = len(joints)
@@ -73,25 +76,35 @@ class JointLimits:
         n = self._n
         A = self._A.copy()
         A[n:] = now.mass
-        lower, upper = np.empty(2 * n), np.empty(2 * n)
-        lower[:n], upper[:n] = self.acceleration_bounds(now)
-        offset = now.nonlinear + integral
-        lower[n:] = -self.torque - offset
-        upper[n:] = self.torque - offset
-        return ConstraintRows(A, lower, upper)
+        bounds = np.empty((2, 2 * n))
+        bounds[:, :n] = self.acceleration_bounds(now)
+        np.subtract(self._torque_sides, now.nonlinear + integral, out=bounds[:, n:])
+        return ConstraintRows(A, bounds[0], bounds[1])
 
-    def acceleration_bounds(self, now: Configuration) -> tuple[Array, Array]:
-        """Bounds (n,) [rad/s²] on q̈ from range and speed, lower ≤ upper."""
-        left = np.maximum(self.torque - np.abs(now.nonlinear), BRAKING_FLOOR * self.torque)
+    def acceleration_bounds(self, now: Configuration) -> Array:
+        """Lower and upper bounds (2, n) [rad/s²] on q̈ from range and speed, lower ≤ upper."""
+        left = np.maximum(self.torque - np.abs(now.nonlinear), self._braking_floor)
         twice_deceleration = 2.0 * BRAKING_SHARE * left / now.mass.diagonal()
         distance = np.empty((2, self._n))
-        np.subtract(self.position_max, now.position, out=distance[0])
-        np.subtract(now.position, self.position_min, out=distance[1])
+        np.subtract(now.position, self.position_min, out=distance[0])
+        np.subtract(self.position_max, now.position, out=distance[1])
+        outside = distance < 0.0
+        if np.count_nonzero(outside):
+            speed = self._speeds_outside(distance, twice_deceleration, outside)
+        else:
+            braking = np.sqrt(twice_deceleration * distance)
+            speed = np.minimum(np.minimum(distance / self._damper, braking), self.speed)
+            np.negative(speed[0], out=speed[0])
+        speed -= now.velocity
+        speed /= self._response
+        return speed
+
+    def _speeds_outside(self, distance: Array, twice_deceleration: Array, outside: NDArray[np.bool_]) -> Array:
+        """Speed limits (2, n), downwards and upwards, where a joint is beyond its range."""
         braking = np.sqrt(twice_deceleration * np.abs(distance))
-        braking[distance < 0.0] = np.inf
+        braking[outside] = np.inf
         speed = np.maximum(np.minimum(np.minimum(distance / self._damper, braking), self.speed), -self.speed)
-        above, below = speed[0], -speed[1]
-        # Outside of the range on one side, the way back wins over the other side's limit
-        below = np.where(now.position > self.position_max, np.minimum(below, above), below)
-        above = np.maximum(above, below)
-        return (below - now.velocity) / self._response, (above - now.velocity) / self._response
+        below, above = -speed[0], speed[1]
+        # The way back wins over the other side's limit
+        below = np.where(outside[1], np.minimum(below, above), below)
+        return np.stack((below, np.maximum(above, below)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum, auto
@@ -92,7 +93,8 @@ class Controller:
         servo = all(joint.drive.kind == "servo" for joint in description.joints)
         self._still_mode = ControlMode.SERVO if servo else ControlMode.POSITION
         self._torque_limits: Vector = tuple(self._qp.limits.torque.tolist())
-        self._torques: deque[Array] = deque(maxlen=TORQUE_SAMPLES)
+        self._reported_torque = (1.0 + CLIP_SHARE) * self._qp.limits.torque
+        self._torques: deque[Vector] = deque(maxlen=TORQUE_SAMPLES)
         self._stage = Stage.HOLD
         self._sequence: int | None = None
         self._position = np.zeros(self._n)
@@ -119,7 +121,7 @@ class Controller:
         measured, cycles = self._accept(state)
         estimate = self._estimator.estimate(measured, cycles)
         if state.motor_torque_measured is not None:
-            self._torques.append(np.array(state.motor_torque_measured))
+            self._torques.append(state.motor_torque_measured)
         time = self._schedule.at(state.sequence)
         before, self._stage = self._stage, self._next_stage(state, time.phase.mode)
         elapsed_s = cycles * self._period
@@ -141,7 +143,7 @@ class Controller:
                 " is another robot running under the same namespace?"
             )
         measured = np.array(state.position_measured)
-        if not np.isfinite(measured).all():
+        if not all(map(math.isfinite, state.position_measured)):
             worst = int(np.argmin(np.isfinite(measured)))
             raise StateError(f"state {state.sequence}: position of {self._model.names[worst]} is {measured[worst]}")
         cycles = 1 if self._sequence is None else state.sequence - self._sequence
@@ -217,7 +219,7 @@ class Controller:
         limits = self._qp.limits.torque
         torque = reference + integral
         clipped = np.minimum(np.maximum(torque, -limits), limits)
-        if (np.abs(torque) > (1.0 + CLIP_SHARE) * limits).any():
+        if np.count_nonzero(np.abs(torque) > self._reported_torque):
             solution = replace(solution, status=f"{solution.status}, torque clipped")
         terms = LawTerms(error, reference, integral)
         return _Tick(
@@ -239,7 +241,7 @@ class Controller:
                 " Use position mode, or set controller.initialize_integral to false."
             )
         if np.abs(estimate.velocity).max() > REST_SPEED:
-            return self._torques[-1]
+            return np.array(self._torques[-1])
         mean: Array = np.mean(self._torques, axis=0)
         return mean
 
@@ -255,12 +257,12 @@ class Controller:
 
     def _command(self, state: RobotState, tick: _Tick) -> JointCommand:
         value = tick.torque if tick.position_command is None else tick.position_command
-        if not np.isfinite(value).all():
+        vector = tuple(value.tolist())
+        if not all(map(math.isfinite, vector)):
             worst = int(np.argmin(np.isfinite(value)))
             raise ControllerError(
                 f"state {state.sequence}: the {tick.mode.value} command of {self._model.names[worst]} is {value[worst]}"
             )
-        vector = tuple(value.tolist())
         return JointCommand(
             session=self._session,
             sequence=state.sequence,
@@ -307,6 +309,5 @@ def _firmware_target(state: RobotState) -> Array:
 
 
 def _pose(position: Array, rotation: Array) -> PoseSample:
-    x, y, z, w = pin.Quaternion(rotation).coeffs().tolist()
-    px, py, pz = position.tolist()
+    px, py, pz, x, y, z, w = pin.SE3ToXYZQUATtuple(pin.SE3(rotation, position))
     return PoseSample(position_in_world=(px, py, pz), orientation_to_world=(w, x, y, z))

@@ -29,7 +29,8 @@ class LawTerms:
 
 def inverse_dynamics(now: Configuration, acceleration: Array) -> Array:
     """(2) without contacts: uʳ = M q̈ʳ + C q̇ + g (n,) [N·m]."""
-    torque: Array = now.mass @ acceleration + now.nonlinear
+    torque: Array = now.mass.dot(acceleration)
+    torque += now.nonlinear
     return torque
 
 
@@ -73,7 +74,8 @@ class IntegralTerm:
         if not self._enabled:
             return np.zeros_like(now.velocity), np.zeros_like(now.velocity)
         error = self.velocity_reference - now.velocity
-        torque: Array = integral_gain(now, self._lambda) @ error
+        torque: Array = now.coriolis.dot(error)
+        torque += self._lambda * now.mass.diagonal() * error
         return error, torque
 
     def advance(self, acceleration: Array, elapsed_s: float) -> None:

@@ -80,6 +80,7 @@ class RobotModel:
         order = [self.model.joints[self.model.getJointId(name)].idx_v for name in self.names]
         self._order = None if order == list(range(self.n)) else np.array(order)
         """Pinocchio's index of each joint of the description; None when they are the same."""
+        self._grid = np.ix_(order, order)
         armature = np.zeros(self.n)
         armature[order] = [joint.rotor_inertia * joint.gear_ratio**2 for joint in description.joints]
         self.model.armature = armature
@@ -108,15 +109,19 @@ class RobotModel:
         nonlinear = pin.nonLinearEffects(model, data, q, v)
         coriolis = pin.computeCoriolisMatrix(model, data, q, v)  # leaves the joint Jacobians in data as well
         if order is not None:
-            grid = np.ix_(order, order)
-            mass, nonlinear, coriolis = mass[grid], nonlinear[order], coriolis[grid]
+            mass, nonlinear, coriolis = mass[self._grid], nonlinear[order], coriolis[self._grid]
         frames: dict[str, FrameKinematics] = {}
         if self._frames:
             pin.forwardKinematics(model, data, q, v, self._zero)
             for name, index in self._frames.items():
                 frames[name] = self._kinematics(index, velocity)
         return Configuration(
-            _frozen(position), _frozen(velocity), _frozen(mass), _frozen(coriolis), _frozen(nonlinear), frames
+            _frozen(position.copy()),
+            _frozen(velocity.copy()),
+            _frozen(mass),
+            _frozen(coriolis),
+            _frozen(nonlinear),
+            frames,
         )
 
     def pose(self, position: Array, frame: str) -> tuple[Array, Array]:
@@ -136,14 +141,13 @@ class RobotModel:
         jacobian = pin.getFrameJacobian(model, data, index, axes)
         if self._order is not None:
             jacobian = jacobian[:, self._order]
-        jacobian = _frozen(jacobian)
         drift = pin.getFrameClassicalAcceleration(model, data, index, axes).vector
         return FrameKinematics(
-            _frozen(placement.translation),
-            _frozen(placement.rotation),
-            jacobian,
-            _frozen(jacobian @ velocity),
-            _frozen(drift),
+            _frozen(placement.translation.copy()),
+            _frozen(placement.rotation.copy()),
+            _frozen(jacobian),
+            _frozen(jacobian.dot(velocity)),
+            _frozen(drift.copy()),
         )
 
     def _frame_id(self, name: str) -> int:
@@ -154,9 +158,9 @@ class RobotModel:
 
 
 def _frozen(array: Array) -> Array:
-    copy = array.copy()
-    copy.flags.writeable = False
-    return copy
+    """Make an array that nobody else holds read-only: Pinocchio's matrices are new ones, its vectors need a copy."""
+    array.setflags(write=False)
+    return array
 
 
 def _build(robot: Robot) -> pin.Model:

@@ -8,7 +8,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from controller_service.model import Array
-from controller_service.qp import SOLVED, QpSolution, residuals
+from controller_service.qp import SOLVED, QpSolution, residuals, stationarity
 
 CHECK_EVERY = 5
 """Iterations between tests of termination."""
@@ -27,10 +27,10 @@ BLOCK_PASSES = 5
 class OsqpSolver:
     """OSQP on the scaled problem (unit rows of A, cost over its largest curvature), polished.
 
-    Where the unconstrained minimiser is feasible it is the start, and OSQP stops at its first test; else the last
-    solution is. OSQP finds which rows are active; the equations of just these rows then give the point to rounding, so
-    ratios of weights of 1000 : 1 and γ of 1e-6 do no harm. (OSQP's own polishing is off: it writes to the standard
-    output where no row is active.)
+    Where the unconstrained minimiser is feasible it is the solution (all multipliers are 0), and OSQP is not asked: 0
+    iterations. Else OSQP starts from the last solution and finds which rows are active; the equations of just these
+    rows then give the point to rounding, so ratios of weights of 1000 : 1 and γ of 1e-6 do no harm. (OSQP's own
+    polishing is off: it writes to the standard output where no row is active.)
 
     Args:
         n: variables.
@@ -76,13 +76,15 @@ class OsqpSolver:
 
     def solve(self, P: Array, q: Array, A: Array, lower: Array, upper: Array) -> QpSolution:
         """Solve; see `Solver`."""
-        factor, fault = lapack.dpotrf(P, lower=1)
+        factor, minimiser, fault = lapack.dposv(P, -q, lower=1)
         if fault != 0:
             return QpSolution(np.zeros_like(q), np.zeros_like(lower), 0, "P is not positive definite", np.inf, np.inf)
-        minimiser = lapack.dpotrs(factor, -q, lower=1)[0]
-        reached = A @ minimiser
-        if ((lower <= reached) & (reached <= upper)).all():
-            self._last, self._dual = minimiser, np.zeros_like(lower)
+        reached = A.dot(minimiser)
+        if np.logical_and.reduce((lower <= reached) & (reached <= upper)):
+            self._last, self._dual = minimiser, np.zeros(len(lower))
+            error = stationarity(P.dot(minimiser) + q, q)
+            if error <= self._tolerance:
+                return QpSolution(minimiser, self._dual, 0, SOLVED, 0.0, error)
         length = np.sqrt(np.einsum("ij,ij->i", A, A))
         cost = 1.0 / P.diagonal().max()
         self._workspace.update_data_vec(
@@ -141,7 +143,7 @@ def _polish(
     With S the active rows and b their bounds: (A_S P⁻¹ A_Sᵀ) y = −(b + A_S P⁻¹ q), x = −P⁻¹(q + A_Sᵀ y).
     """
     n = len(q)
-    Ax = A @ x
+    Ax = A.dot(x)
     at_upper = upper - Ax < pull
     at_lower = Ax - lower < -pull
     inverse = lapack.dpotrs(factor, np.column_stack((A.T, q)), lower=1)[0]
@@ -149,20 +151,21 @@ def _polish(
         rows = np.flatnonzero(at_upper | at_lower)
         if len(rows) > n:
             return x, dual
-        y = np.zeros_like(dual)
+        y = np.zeros(len(dual))
         free = inverse[:, -1]
         if len(rows):
-            bound = np.where(at_upper[rows], upper[rows], lower[rows])
-            gram, fault = lapack.dpotrf(A[rows] @ inverse[:, rows], lower=1)
+            active = A[rows]
+            bound = np.where(at_upper, upper, lower)[rows]
+            _, multipliers, fault = lapack.dposv(active.dot(inverse[:, rows]), -(bound + active.dot(free)), lower=1)
             if fault != 0:
                 return x, dual
-            y[rows] = lapack.dpotrs(gram, -(bound + A[rows] @ free), lower=1)[0]
-        point = -(free + inverse[:, :-1] @ y)
-        point_Ax = A @ point
+            y[rows] = multipliers
+        point = -(free + inverse[:, :-1].dot(y))
+        point_Ax = A.dot(point)
         slack = 1e-9 * (1.0 + np.abs(point_Ax))
         wrong = (at_upper & (y < 0.0)) | (at_lower & (y > 0.0))
         over, under = point_Ax > upper + slack, point_Ax < lower - slack
-        if not (wrong | over | under).any():
+        if not np.count_nonzero(wrong | over | under):
             return point, y
         if done >= BLOCK_PASSES:  # one row at a time, lest the set goes round in circles
             blame = np.where(wrong, np.abs(y) * length, np.maximum(point_Ax - upper, lower - point_Ax) / length)

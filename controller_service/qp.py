@@ -52,17 +52,21 @@ def residuals(P: Array, q: Array, A: Array, lower: Array, upper: Array, x: Array
     dual: largest of |P x + q + Aᵀ y| over its terms' scale 1 + max |q|, and of the products y⁺ (u − A x), y⁻ (A x − l)
     (complementarity), over 1 + |q|·|x|.
     """
-    Ax = A @ x
+    Ax = A.dot(x)
     excess = np.maximum(lower - Ax, Ax - upper)
     primal = float((np.maximum(excess, 0.0) / (1.0 + np.abs(Ax))).max()) if excess.max() > 0.0 else 0.0
-    gradient = P @ x + q
     if not dual.any():
-        return primal, float(np.abs(gradient).max() / (1.0 + np.abs(q).max()))
-    stationarity = float(np.abs(gradient + dual @ A).max() / (1.0 + np.abs(q).max()))
+        return primal, stationarity(P.dot(x) + q, q)
+    stationary = stationarity(P.dot(x) + q + dual.dot(A), q)
     active = dual != 0.0
     bound = np.where(dual > 0.0, upper, lower)[active]
     products = np.abs(dual[active] * (bound - Ax[active])).max() / (1.0 + np.abs(q) @ np.abs(x))
-    return primal, max(stationarity, float(products))
+    return primal, max(stationary, float(products))
+
+
+def stationarity(gradient: Array, q: Array) -> float:
+    """Return the largest |∇ₓL| (n,) over its terms' scale 1 + max |q|."""
+    return float(np.maximum.reduce(np.abs(gradient)) / (1.0 + np.maximum.reduce(np.abs(q))))
 
 
 def objective(tasks: Sequence[Task], n: int, regularization: float) -> tuple[Array, Array]:
@@ -71,8 +75,8 @@ def objective(tasks: Sequence[Task], n: int, regularization: float) -> tuple[Arr
     P = Σ w_t A_tᵀ A_t + γ I, q = −Σ w_t A_tᵀ b_t. A task's weight multiplies its squared norm: 𝒲 of (5) is √w_t.
     """
     P = np.zeros((n, n))
+    P.flat[:: n + 1] = regularization
     q = np.zeros(n)
     for task in tasks:
         task.add_to(P, q)
-    P.flat[:: n + 1] += regularization
     return P, q

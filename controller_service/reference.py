@@ -57,8 +57,8 @@ class HandHold:
 
     def at(self, time_s: float) -> PoseTarget:
         """Return the pose, at rest."""
-        zero = np.zeros(3)
-        return PoseTarget(self.position, zero, zero, self.rotation, zero, zero)
+        zero = np.zeros(6)
+        return PoseTarget(self.position, self.rotation, zero, zero)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +80,14 @@ class CirclePath:
         first, second = AXES[self.path.plane]
         radius = 0.5 * self.path.diameter_m
         sine, cosine = math.sin(angle), math.cos(angle)
-        position, speed, change, zero = self.start.copy(), np.zeros(3), np.zeros(3), np.zeros(3)
+        position, speed, change = self.start.copy(), np.zeros(6), np.zeros(6)
         position[first] += radius * (cosine - 1.0)
         position[second] += radius * sine
         speed[first] = -radius * sine * rate
         speed[second] = radius * cosine * rate
         change[first] = -radius * (sine * acceleration + cosine * rate * rate)
         change[second] = radius * (cosine * acceleration - sine * rate * rate)
-        return PoseTarget(position, speed, change, self.rotation, zero, zero)
+        return PoseTarget(position, self.rotation, speed, change)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,14 +109,14 @@ class SquarePath:
         side = index % 4
         axis = AXES[self.path.plane][side % 2]
         length = self.path.diameter_m * (-1.0, 1.0, 1.0, -1.0)[side]
-        position, speed, change, zero = self.start.copy(), np.zeros(3), np.zeros(3), np.zeros(3)
+        position, speed, change = self.start.copy(), np.zeros(6), np.zeros(6)
         first, second = AXES[self.path.plane]
         position[first] -= self.path.diameter_m * (side in (1, 2))
         position[second] += self.path.diameter_m * (side in (2, 3))
         position[axis] += length * value
         speed[axis] = length * rate
         change[axis] = length * acceleration
-        return PoseTarget(position, speed, change, self.rotation, zero, zero)
+        return PoseTarget(position, self.rotation, speed, change)
 
 
 def hand_motion(start: Array, rotation: Array, path: HandPath | None) -> HandMotion:

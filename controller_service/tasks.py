@@ -23,14 +23,16 @@ class PostureTarget:
 
 @dataclass(frozen=True, slots=True)
 class PoseTarget:
-    """Desired motion of a frame in world axes: p^d, v^d, v̇^d (3,), R^d (3, 3) frame to world, ω^d, ω̇^d (3,)."""
+    """Desired motion of a frame in world axes, in the layout of `FrameKinematics`."""
 
     position: Array
-    velocity: Array
-    acceleration: Array
+    """p^d (3,) [m]."""
     rotation: Array
-    angular_velocity: Array
-    angular_acceleration: Array
+    """R^d (3, 3), frame to world."""
+    velocity: Array
+    """[v^d; ω^d] (6,)."""
+    acceleration: Array
+    """[v̇^d; ω̇^d] (6,)."""
 
 
 class Task(Protocol):
@@ -100,20 +102,21 @@ class PoseTask:
         error = np.empty(6)
         error[:3] = target.position - now.position
         error[3:] = orientation_error(target.rotation, now.rotation)
-        velocity = np.concatenate((target.velocity, target.angular_velocity))
-        acceleration = np.concatenate((target.acceleration, target.angular_acceleration))
-        objective = gains.stiffness * error + gains.damping * (velocity - now.velocity) + acceleration
-        return now.jacobian, objective - now.drift
+        objective: Array = gains.stiffness * error
+        objective += gains.damping * (target.velocity - now.velocity)
+        objective += target.acceleration
+        objective -= now.drift
+        return now.jacobian, objective
 
     def add_to(self, P: Array, q: Array) -> None:
         """Add w JᵀJ to P and −w Jᵀb to q, in place."""
         A, b = self.linear()
         weighted = self.gains.weight * A.T
-        P += weighted @ A
-        q -= weighted @ b
+        P += weighted.dot(A)
+        q -= weighted.dot(b)
 
 
 def orientation_error(desired: Array, current: Array) -> Array:
     """Ω̃ = S⁻¹(log(R^d Rᵀ)) of (8): the rotation vector (3,) [rad] in world axes from `current` to `desired`."""
-    error: Array = pin.log3(desired @ current.T)
+    error: Array = pin.log3(desired.dot(current.T))
     return error

@@ -105,7 +105,7 @@ def show(robot: RobotDescription, diagnosis: Diagnosis, console: Console) -> Non
     """Print the tables."""
     console.print(
         f"[bold]{robot.name}[/]: {len(robot.joints)} joints, {len(robot.buses)} buses, {robot.rate_hz:g} Hz,"
-        f" commands take effect {robot.command_delay_cycles} SYNC after the measured one; hand frame"
+        f" commands take effect at SYNC {robot.command_delay_cycles} after the measured one; hand frame"
         f" {robot.hand_frame or 'none'}"
     )
     console.print(_joint_table(robot))

@@ -41,6 +41,10 @@ class Bar:
         }
 
 
+def no_progress(_share: float, _what: str) -> None:
+    """Tell nobody."""
+
+
 @dataclass(frozen=True, slots=True)
 class ExperimentRequest:
     """What the command line asks of an experiment."""
@@ -52,6 +56,8 @@ class ExperimentRequest:
     """Where logs and plots go; None writes none."""
     processes: bool = False
     """Services as separate processes instead of one."""
+    progress: Callable[[float, str], None] = no_progress
+    """Told what share of the experiment is done and what comes next."""
 
 
 @dataclass(frozen=True, slots=True)

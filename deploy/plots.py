@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -21,34 +22,40 @@ STYLE: dict[str, dict[str, Any]] = {
     "reference": {"color": "black", "linewidth": 1.6},
     "computed": {"color": "#7b3294", "linewidth": 1.2},
     "integral": {"color": "#2166ac", "linewidth": 1.2},
-    "measured": {"color": "#999999", "linewidth": 1.0, "linestyle": "--"},
+    "measured": {"color": "#888888", "linewidth": 1.0, "linestyle": "--"},
+    "true": {"color": "#e08214", "linewidth": 0.9},
 }
-"""The colours of Fig. 3 of [Benallegue 2021]."""
+"""The colours of Fig. 3 of [Benallegue 2021]; what only the plant knows is orange."""
+CHANGE_COLOUR = "#d6604d"
+TORQUE_MODE_COLOUR = "#eeeeee"
 
 
 def transition_figure(series: RunSeries, change: ModeChange) -> Figure:
     """Torques of every joint around a mode change, as Fig. 3 of [Benallegue 2021].
 
     Black: the torque reference given to the motors (in position mode there is none); purple: the computed torque uʳ;
-    blue: the integral term; grey: the motor torque measured from the current, and the true one at the firmware's rate.
+    blue: the integral term, all three at the time when the command takes effect; grey: the motor torque measured from
+    the current; orange: the true one at the firmware's rate.
     """
-    names = series.run.robot.description.joint_names
+    robot = series.run.robot.description
+    names = robot.joint_names
     figure, axes = _grid(len(names), f"Torques at the change of mode at {change.time_s:.3f} s ({_direction(change)})")
-    start, end = change.time_s - BEFORE_S, change.time_s + AFTER_S
     trace, state = series.trace, series.state
-    ticks = (trace.time_s >= start) & (trace.time_s <= end)
-    cycles = (state.time_s >= start) & (state.time_s <= end)
-    trace_ms = (trace.time_s[ticks] - change.time_s) * 1e3
-    state_ms = (state.time_s[cycles] - change.time_s) * 1e3
-    commanded = np.where(trace.torque_mode[ticks][:, None], trace.torque_commanded[ticks], np.nan)
-    integral = np.where(trace.torque_mode[ticks][:, None], trace.torque_integral[ticks], np.nan)
+    effect_s = trace.time_s + robot.command_delay_cycles * robot.period_s
+    ticks, trace_ms = _window(effect_s, change)
+    cycles, state_ms = _window(state.time_s, change)
+    truth_ms, true = _true_torque(series, change)
+    in_torque = trace.torque_mode[ticks][:, None]
+    commanded = np.where(in_torque, trace.torque_commanded[ticks], np.nan)
+    integral = np.where(in_torque, trace.torque_integral[ticks], np.nan)
     for j, (axis, name) in enumerate(zip(axes, names, strict=True)):
+        axis.plot(truth_ms, true[:, j], label="true motor torque", **STYLE["true"])
         axis.plot(state_ms, state.motor_torque[cycles][:, j], label="measured motor torque", **STYLE["measured"])
         axis.plot(trace_ms, trace.torque_reference[ticks][:, j], label="computed torque uʳ", **STYLE["computed"])
         axis.plot(trace_ms, integral[:, j], label="integral term L s", **STYLE["integral"])
         axis.plot(trace_ms, commanded[:, j], label="reference torque u", **STYLE["reference"])
-        axis.axvline(0.0, color="#d6604d", linewidth=0.8)
-        axis.set_title(f"{name}   step {change.torque_step[j]:.2%} of the limit", fontsize=9)
+        axis.axvline(0.0, color=CHANGE_COLOUR, linewidth=0.8)
+        axis.set_title(f"{name}, step {change.torque_step[j]:.2%} of the limit", fontsize=9)
     _finish(figure, axes, "time from the change [ms]", "torque [N·m]")
     return figure
 
@@ -70,7 +77,7 @@ def hand_figure(series: RunSeries) -> Figure | None:
         here = phases == phase
         a, b = _plane(desired[here])
         axis.plot(desired[here][:, a], desired[here][:, b], label="desired", **STYLE["reference"])
-        axis.plot(true[here][:, a], true[here][:, b], label="true", color="#d6604d", linewidth=1.2)
+        axis.plot(true[here][:, a], true[here][:, b], label="true", **STYLE["true"])
         axis.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]", title=f"hand in the world, {phase}")
         axis.set_aspect("equal", adjustable="datalim")
         axis.legend(fontsize=8)
@@ -88,16 +95,41 @@ def hand_figure(series: RunSeries) -> Figure | None:
 
 
 def joints_figure(series: RunSeries) -> Figure:
-    """Measured joint positions and their reference over the whole run."""
+    """Measured joint positions over the whole run, and their reference where the robot is in position mode."""
     names = series.run.robot.description.joint_names
-    figure, axes = _grid(len(names), "Joint positions")
+    figure, axes = _grid(len(names), "Joint positions (torque mode shaded)")
+    trace, state = series.trace, series.state
+    reference = np.degrees(np.where(trace.torque_mode[:, None], np.nan, trace.position_reference))
     for j, (axis, name) in enumerate(zip(axes, names, strict=True)):
-        reference = np.degrees(series.trace.position_reference[:, j])
-        axis.plot(series.trace.time_s, reference, label="reference", **STYLE["measured"])
-        axis.plot(series.state.time_s, np.degrees(series.state.position[:, j]), label="measured", **STYLE["reference"])
+        axis.plot(state.time_s, np.degrees(state.position[:, j]), label="measured", **STYLE["integral"])
+        axis.plot(trace.time_s, reference[:, j], label="reference", color="black", linewidth=1.0, linestyle="--")
+        for start_s, end_s in _spans(trace.time_s, trace.torque_mode):
+            axis.axvspan(start_s, end_s, color=TORQUE_MODE_COLOUR, zorder=0)
         axis.set_title(name, fontsize=9)
     _finish(figure, axes, "time [s]", "position [°]")
     return figure
+
+
+def _window(time_s: Array, change: ModeChange) -> tuple[npt.NDArray[np.bool_], Array]:
+    """Mask (K,) of the times around a change, and these times from the change on [ms]."""
+    mask = (time_s >= change.time_s - BEFORE_S) & (time_s <= change.time_s + AFTER_S)
+    return mask, (time_s[mask] - change.time_s) * 1e3
+
+
+def _true_torque(series: RunSeries, change: ModeChange) -> tuple[Array, Array]:
+    """Give times from the change [ms] and true motor torque (M, n) [N·m] of the firmware's steps around it."""
+    period_s = series.run.robot.description.period_s
+    mask, end_ms = _window(series.truth.time_s, change)
+    torque = series.truth.motor_torque_substeps[mask]
+    count, substeps, n = torque.shape
+    offset_ms = (np.arange(substeps) / max(substeps, 1) - 1.0) * period_s * 1e3
+    return (end_ms[:, None] + offset_ms).ravel(), torque.reshape(count * substeps, n)
+
+
+def _spans(time_s: Array, mask: npt.NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """First and last time of each stretch in which the mask holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
+    return [(float(time_s[first]), float(time_s[end - 1])) for first, end in edges.reshape(-1, 2)]
 
 
 def _grid(count: int, title: str) -> tuple[Figure, list[Axes]]:

@@ -45,7 +45,6 @@ class RunProgress:
 
     def __init__(self, run: Run, console: Console) -> None:
         self._run = run
-        self._console = console
         self._bar = Progress(
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=30),

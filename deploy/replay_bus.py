@@ -46,7 +46,7 @@ def replay_hal(reader: LogReader, exact: bool) -> tuple[int, Difference | None]:
     tolerances: Tolerances | None = None if exact else HAL
     buses = [bus.name for bus in reader.run.robot.description.buses]
     compared = 0
-    for sequence, cycle in _in_order(cycles, buses):
+    for sequence, cycle in _in_order(cycles, buses, gaps=_has_gaps(reader)):
         assert cycle.state is not None
         state = core.decode(sequence, [cycle.received[bus] for bus in buses])
         if (difference := compare(sequence, "state", cycle.state, state, tolerances)) is not None:
@@ -82,8 +82,11 @@ def replay_plant(reader: LogReader, exact: bool) -> tuple[int, Difference | None
     late = [b""] * len(buses)
     used = _used_commands(reader, cycles)
     core = None if exact else _fresh_core(reader, cycles)
-    compared = 0
-    for sequence, cycle in _in_order(cycles, buses, need_state=not exact):
+    compared, last_sequence = 0, -1
+    for sequence, cycle in _in_order(cycles, buses, gaps=_has_gaps(reader), need_state=not exact):
+        for _ in range(last_sequence + 1, sequence):
+            plant.advance()
+        last_sequence = sequence
         received = [late[index] + plant.deliver(index, _to_sync(cycle.sent[bus])) for index, bus in enumerate(buses)]
         plant.advance()
         # RPDOs arrive while the plant has integrated; what it answers to them, the HAL reads with the next reports.
@@ -124,14 +127,22 @@ def _cycles(reader: LogReader) -> dict[int, _Cycle]:
     return cycles
 
 
-def _in_order(cycles: dict[int, _Cycle], buses: list[str], *, need_state: bool = True) -> Iterator[tuple[int, _Cycle]]:
-    """Cycles from 0 on, up to the first that the log does not hold whole."""
-    sequence = 0
-    while (cycle := cycles.get(sequence)) is not None:
-        if len(cycle.sent) < len(buses) or (need_state and cycle.state is None):
+def _has_gaps(reader: LogReader) -> bool:
+    """Whether a whole log may lack sequences: SYNCs whose time had passed are left out in realtime."""
+    return reader.run.scenario.clock is Clock.REALTIME
+
+
+def _in_order(
+    cycles: dict[int, _Cycle], buses: list[str], *, gaps: bool, need_state: bool = True
+) -> Iterator[tuple[int, _Cycle]]:
+    """Cycles from 0 on, up to the first that the log does not hold whole; with `gaps` those are passed over."""
+    for expected, sequence in enumerate(sorted(key for key in cycles if key >= 0)):
+        cycle = cycles[sequence]
+        whole = len(cycle.sent) == len(buses) and (cycle.state is not None or not need_state)
+        if not gaps and (not whole or sequence != expected):
             return
-        yield sequence, cycle
-        sequence += 1
+        if whole:
+            yield sequence, cycle
 
 
 def _used_commands(reader: LogReader, cycles: dict[int, _Cycle]) -> set[int]:

@@ -17,9 +17,10 @@ def summary_table(metrics: RunMetrics) -> Table:
     table.add_column("what", no_wrap=True)
     table.add_column("value", justify="right")
     table.add_row("states / commands / missed", f"{metrics.states} / {metrics.commands} / {metrics.missed_commands}")
-    if metrics.cycle_time_median_s is not None and metrics.cycle_time_max_s is not None:
-        cycle = f"{metrics.cycle_time_median_s * 1e3:.2f} / {metrics.cycle_time_max_s * 1e3:.2f} ms"
-        table.add_row("cycle time, median / worst", cycle)
+    cycle = (metrics.cycle_time_median_s, metrics.cycle_time_p99_s, metrics.cycle_time_max_s)
+    if None not in cycle:
+        text = " / ".join(f"{time_s * 1e3:.2f}" for time_s in cycle if time_s is not None)
+        table.add_row("cycle time, median / 99 % / worst", f"{text} ms")
     if metrics.real_time_factor is not None:
         table.add_row("real-time factor", f"{metrics.real_time_factor:.2f}")
     if metrics.late_cycles:

@@ -22,7 +22,7 @@ from deploy.plots import transition_figure
 from deploy.runner import run_to_log
 from deploy.series import RunSeries, read_series
 from schemas.fingerprint import fingerprint
-from schemas.load import Robot, load_run
+from schemas.load import Robot, Run, load_run
 
 SCENARIO: Final = "arm9-transition"
 POSES: Final[dict[str, dict[str, dict[str, float]]]] = {
@@ -44,6 +44,14 @@ DEVIATION_LIMIT_RAD: Final = float(np.radians(0.5))
 NAIVE_FACTOR: Final = 10.0
 DIRECTIONS: Final = {"to_torque": CST, "to_position": CSP}
 
+START_SHARE: Final = 0.8
+"""The robot starts at this share of the pose: the reach is short on any robot, yet a motion that loads the friction."""
+ANY_ROBOT: Final[dict[str, Any]] = {
+    "plant.initial_posture": {},
+    "controller.phases": [{"name": "hold", "mode": "position", "duration_s": 1.0}],
+}
+"""What the scenario says of its own robot's joints, left out."""
+
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
 
@@ -57,26 +65,30 @@ class Switches:
 
 def run(request: ExperimentRequest) -> ExperimentResult:
     """Run the experiment for one seed: all poses, properly and naively."""
-    robot = load_run(SCENARIO, request.overrides).robot
+    scenario = load_run(SCENARIO, {**ANY_ROBOT, **request.overrides})
+    robot = scenario.robot
     poses = _poses(robot)
     proper: dict[str, Switches] = {}
     naive: dict[str, Switches] = {}
     with TemporaryDirectory() as scratch:
         directory = request.directory or Path(scratch)
-        for name, pose in poses.items():
-            series = _run(request, pose, directory / name, {})
+        for number, (name, pose) in enumerate(poses.items()):
+            request.progress(number / len(poses), name)
+            series = _run(request, robot, pose, directory / name, {})
             proper[name] = _switches(series)
             if request.directory is not None:
                 _plot(series, directory / name)
+            request.progress((number + 0.5) / len(poses), f"{name}, naive")
             baseline = {"controller.initialize_integral": False, "robot.safety.holding": "none"}
-            naive[name] = _switches(_run(request, pose, directory / f"{name}-naive", baseline))
-    return _result(request, robot, proper, naive)
+            naive[name] = _switches(_run(request, robot, pose, directory / f"{name}-naive", baseline))
+    return _result(request, scenario, proper, naive)
 
 
 def _result(
-    request: ExperimentRequest, robot: Robot, proper: dict[str, Switches], naive: dict[str, Switches]
+    request: ExperimentRequest, scenario: Run, proper: dict[str, Switches], naive: dict[str, Switches]
 ) -> ExperimentResult:
-    metrics: dict[str, Any] = {"joints": list(robot.description.joint_names), "poses": list(proper)}
+    robot = scenario.robot.description
+    metrics: dict[str, Any] = {"joints": list(robot.joint_names), "poses": list(proper)}
     bars = []
     for direction in DIRECTIONS:
         step = _worst(proper, "step", direction)
@@ -95,8 +107,7 @@ def _result(
     for name, switches in proper.items():
         metrics[f"{name}_torque_step_fraction"] = {d: float(switches.step[d].max()) for d in DIRECTIONS}
         metrics[f"{name}_joint_deviation_rad"] = {d: float(switches.deviation[d].max()) for d in DIRECTIONS}
-    versions = fingerprint(load_run(SCENARIO, request.overrides))
-    return ExperimentResult("transition", robot.description.name, request.seed, versions, metrics, tuple(bars))
+    return ExperimentResult("transition", robot.name, request.seed, fingerprint(scenario), metrics, tuple(bars))
 
 
 def _poses(robot: Robot) -> dict[str, dict[str, float]]:
@@ -109,7 +120,7 @@ def _poses(robot: Robot) -> dict[str, dict[str, float]]:
 
 
 def _run(
-    request: ExperimentRequest, pose: dict[str, float], directory: Path, overrides: dict[str, Any]
+    request: ExperimentRequest, robot: Robot, pose: dict[str, float], directory: Path, overrides: dict[str, Any]
 ) -> RunSeries:
     phases = [
         {"name": "reach", "mode": "position", "duration_s": REACH_S, "posture": pose},
@@ -120,12 +131,19 @@ def _run(
     fixed = {
         "duration_s": REACH_S + SETTLE_S + TORQUE_S + POSITION_S,
         "controller.phases": phases,
-        # Starting near the pose keeps the reach short on any robot; it still arrives by a motion, with friction loaded.
-        "plant.initial_posture": {joint: 0.8 * angle for joint, angle in pose.items()},
+        "plant.initial_posture": _start(robot, pose),
         "seed": request.seed,
     }
     run = load_run(SCENARIO, {**fixed, **request.overrides, **overrides})
     return read_series(run_to_log(run, directory, processes=request.processes))
+
+
+def _start(robot: Robot, pose: dict[str, float]) -> dict[str, float]:
+    joints = {joint.name: joint for joint in robot.description.joints}
+    return {
+        name: min(max(START_SHARE * angle, joints[name].position_min), joints[name].position_max)
+        for name, angle in pose.items()
+    }
 
 
 def _switches(series: RunSeries) -> Switches:
@@ -141,7 +159,7 @@ def _switches(series: RunSeries) -> Switches:
 
 
 def _worst(runs: dict[str, Switches], what: str, direction: str) -> Array:
-    return np.max([getattr(switches, what)[direction] for switches in runs.values()], axis=0)
+    return np.asarray(np.max([getattr(switches, what)[direction] for switches in runs.values()], axis=0), np.float64)
 
 
 def _plot(series: RunSeries, directory: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Final
 
 import numpy as np
@@ -55,10 +56,8 @@ class CommandCheck:
                 raise CommandRefused(field, None, f"given in mode {command.mode.value}")
             if len(values) != len(self._joints):
                 raise CommandRefused(f"length of {field}", len(values), f"{len(self._joints)}, one a joint")
-            array = np.array(values, dtype=np.float64)
-            finite = np.isfinite(array)
-            if not finite.all():
-                joint = int(np.flatnonzero(~finite)[0])
-                raise CommandRefused(field, float(array[joint]), "finite", self._joints[joint])
-            arrays[field] = array
+            if not all(map(isfinite, values)):
+                joint = next(joint for joint, value in enumerate(values) if not isfinite(value))
+                raise CommandRefused(field, values[joint], "finite", self._joints[joint])
+            arrays[field] = np.array(values, dtype=np.float64)
         return arrays

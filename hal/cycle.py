@@ -10,10 +10,11 @@ import numpy as np
 
 from hal.commands import CommandCheck
 from hal.compose import Composer, released
-from hal.decode import Decoder, Measured
+from hal.decode import Decoder, Measured, Notice
 from hal.drivers import Controlwords, DriverGroup, operation_mode
 from hal.errors import CommandRefused, DriveFaultError, HalError
 from hal.expected import expected_reports
+from hal.guard import MotionGuard
 from hal.holding import Predictor
 from hal.limits import Onsets
 from hal.profile.cia402 import Controlword, OperationMode, next_controlword
@@ -51,16 +52,21 @@ class HalCore:
         self._check = CommandCheck(robot, self._drivers)
         self._composer = Composer(robot)
         self._supervisor = Supervisor(robot)
+        self._guard = MotionGuard(robot)
         self._onsets = Onsets(len(robot.joints))
         self._events: list[Event] = []
         self._queue: deque[Setpoint] = deque()
         self._all_enabled: Controlwords = np.full(len(robot.joints), Controlword.ENABLE_OPERATION, dtype=np.uint16)
         self._reports_torque = bool(self._drivers.reports_torque.all())
-        self._seen: tuple[bytes, bytes, ControlMode] | None = None
+        self._seen: Measured | None = None
+        """Measured that the tuples below were made of."""
+        self._seen_mode = ControlMode.POSITION
         self._servo = np.array([joint.drive.kind == "servo" for joint in robot.joints])
         self._sequence = HAL_DECIDED
         self._missed_in_a_row = 0
         self._refusal: tuple[str, str | None] | None = None
+        self._foreign: set[str] = set()
+        """Foreign sessions that have been told of, once each: an intruder may answer every state."""
         self._commanded = False
         self._safe_stop = False
         self._emergency_stop = False
@@ -68,6 +74,7 @@ class HalCore:
         self._expected: dict[tuple[bool, frozenset[int], frozenset[str]], tuple[frozenset[int], ...]] = {}
         self._modes: tuple[ControlMode, ...] = (ControlMode.POSITION,) * len(robot.joints)
         self._states: tuple[DriveState, ...] = (DriveState.OPERATION_ENABLED,) * len(robot.joints)
+        self._errors: tuple[int, ...] = (0,) * len(robot.joints)
         self._measured: Measured | None = None
 
     def start(self, positions: Array) -> None:
@@ -123,7 +130,7 @@ class HalCore:
         self._review(measured)
         self._update_tuples(measured)
         torque = vector(measured.motor_torque) if self._reports_torque else None
-        return RobotState.model_construct(
+        return RobotState(
             sequence=sequence,
             time_ns=sequence * self.robot.period_ns,
             status=self.status,
@@ -131,7 +138,7 @@ class HalCore:
             motor_torque_measured=torque,
             drive_state=self._states,
             mode=self._modes,
-            error_code=tuple(measured.error_code.tolist()),
+            error_code=self._errors,
             applied=self._latched.applied(),
             wrenches=measured.wrenches,
             imus=measured.imus,
@@ -224,7 +231,10 @@ class HalCore:
             arrays = self._check.check(command, self._sequence, self._session)
         except CommandRefused as refusal:
             evidence = (refusal.field, refusal.joint)
-            if self.status is HalStatus.ACTIVE and evidence != self._refusal:
+            told = command.session in self._foreign if refusal.field == "session" else evidence == self._refusal
+            if self.status is HalStatus.ACTIVE and not told:
+                if refusal.field == "session":
+                    self._foreign.add(command.session)
                 self._refusal = evidence
                 joint = None if refusal.joint is None else self.robot.joint_names.index(refusal.joint)
                 self._tell("command_refused", "warning", f"command refused: {refusal}", joint)
@@ -249,15 +259,21 @@ class HalCore:
 
     def _review(self, measured: Measured) -> None:
         mode = operation_mode(self._latched.mode)
-        for notice in self._supervisor.review(measured, mode, self._decoder.sensor_ages):
+        notices = self._supervisor.review(measured, mode, self._decoder.sensor_ages)
+        if self._latched.mode is ControlMode.TORQUE and self.status is HalStatus.ACTIVE:
+            notices += self._guard.review(measured.position, self._predictor.mean_velocity)
+        for notice in notices:
             self._tell(notice.kind, notice.severity, notice.text, notice.joint)
             if notice.stops:
-                if self.cause is None and notice.joint is not None:
-                    joint = notice.joint
-                    state = DriveState(int(measured.drive_state[joint])).name
-                    code = int(measured.error_code[joint])
-                    self.cause = DriveFaultError(self.robot.joint_names[joint], state, code, notice.text)
+                self.cause = self.cause or self._cause(notice, measured)
                 self.stop(notice.text)
+
+    def _cause(self, notice: Notice, measured: Measured) -> HalError:
+        joint = notice.joint
+        if joint is None or notice.kind in MotionGuard.KINDS:
+            return HalError(notice.text)
+        state = DriveState(int(measured.drive_state[joint])).name
+        return DriveFaultError(self.robot.joint_names[joint], state, int(measured.error_code[joint]), notice.text)
 
     def _controlwords(self, measured: Measured) -> Controlwords:
         if self._supervisor.all_enabled:
@@ -273,10 +289,17 @@ class HalCore:
         return np.array(words, dtype=np.uint16)
 
     def _update_tuples(self, measured: Measured) -> None:
-        seen = (measured.drive_state.tobytes(), measured.mode.tobytes(), self._latched.mode)
-        if seen == self._seen:
+        seen, mode = self._seen, self._latched.mode
+        if (
+            seen is not None
+            and measured.drive_state is seen.drive_state
+            and measured.mode is seen.mode
+            and measured.error_code is seen.error_code
+            and mode is self._seen_mode
+        ):
             return
-        self._seen = seen
+        self._seen, self._seen_mode = measured, mode
+        self._errors = tuple(measured.error_code.tolist())
         self._states = tuple(map(_STATES.__getitem__, measured.drive_state.tolist()))
         csp = ControlMode.SERVO if self._latched.mode is ControlMode.SERVO else ControlMode.POSITION
         self._modes = tuple(

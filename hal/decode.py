@@ -52,7 +52,7 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What the robot reported, arrays over the joints."""
+    """What the robot reported, arrays over the joints; an array that did not change is the one of the cycle before."""
 
     position: Array
     """[rad]."""
@@ -77,8 +77,10 @@ class _Plan:
 
     joints: npt.NDArray[np.intp]
     """Of the TPDO1s, in their order."""
-    rows: npt.NDArray[np.intp]
-    """Of the TPDO1s among the frames."""
+    words: npt.NDArray[np.intp]
+    """Their data among the words of 8 bytes."""
+    complete: bool
+    """Every joint is among them."""
     others: tuple[tuple[int, int, int, int], ...]
     """Kind, index of joint or sensor, and the data's first and last byte of every other known frame."""
 
@@ -104,9 +106,7 @@ class _ForceTorque:
         if self._last is None:
             return None
         force, torque = self._last
-        return WrenchSample.model_construct(
-            name=self.sensor.name, force_in_sensor=force, torque_in_sensor=torque, age_cycles=self.age
-        )
+        return WrenchSample(name=self.sensor.name, force_in_sensor=force, torque_in_sensor=torque, age_cycles=self.age)
 
 
 class _Inertial:
@@ -131,7 +131,7 @@ class _Inertial:
         if self._last is None:
             return None
         angular_velocity, acceleration, orientation = self._last
-        return ImuSample.model_construct(
+        return ImuSample(
             name=self.sensor.name,
             angular_velocity_in_imu=angular_velocity,
             acceleration_in_imu=acceleration,
@@ -152,12 +152,18 @@ class Decoder:
         count = len(robot.joints)
         self._joints = robot.joint_names
         self._units = DriveUnits.of(robot)
-        self._counts = self._units.counts_from_position(np.asarray(positions, dtype=np.float64))
-        self._per_mille = np.zeros(count, dtype=np.int16)
+        self._reports = np.zeros(count, dtype="<u8")
+        """Data of the last TPDO1 of each joint."""
+        reports = self._reports.view(STATE_LAYOUT)
+        self._statusword, self._counts, self._per_mille = reports["statusword"], reports["position"], reports["torque"]
+        self._counts[:] = self._units.counts_from_position(np.asarray(positions, dtype=np.float64))
+        self._decoded = b""
+        """Statuswords that `_state` holds; empty when one is undefined."""
         self._state = np.full(count, DriveState.OPERATION_ENABLED, dtype=np.int8)
         self._mode = np.full(count, OperationMode.CSP, dtype=np.int8)
         self._error = np.zeros(count, dtype=np.uint16)
-        self._silent = np.zeros(count, dtype=np.int64)
+        self._none_silent = np.zeros(count, dtype=np.int64)
+        self._silent = self._none_silent
         self._force_torque = [_ForceTorque(sensor) for sensor in robot.force_torque_sensors]
         self._inertial = [_Inertial(imu) for imu in robot.imus]
         self._sensors: list[_ForceTorque | _Inertial] = [*self._force_torque, *self._inertial]
@@ -186,9 +192,10 @@ class Decoder:
         words = np.frombuffer(packet, "<u8")
         plan = self._plan(tuple(map(len, frames_per_bus)), packet, words[0::2])
         notices: list[Notice] = []
-        self._silent = self._silent + 1
+        self._silent = self._none_silent if plan.complete else self._silent + 1
         if len(plan.joints):
-            self._read_states(plan.joints, words[1::2].take(plan.rows).view(STATE_LAYOUT), notices)
+            self._reports[plan.joints] = words[plan.words]
+            self._read_states(plan, notices)
         for kind, index, start, end in plan.others:
             self._read_other(kind, index, packet[start:end], notices)
         wrenches = [unit.sample() for unit in self._force_torque]
@@ -224,21 +231,28 @@ class Decoder:
         for row in np.flatnonzero(kind > _STATE).tolist():
             start = row * FRAME_BYTES + _DATA
             others.append((int(kind[row]), int(self._index[key[row]]), start, start + int(frames["length"][row])))
-        return _Plan(self._index[key[rows]], rows, tuple(others))
+        joints = self._index[key[rows]]
+        return _Plan(joints, 2 * rows + 1, len(np.unique(joints)) == len(self._joints), tuple(others))
 
-    def _read_states(self, joints: npt.NDArray[np.intp], rows: npt.NDArray[np.void], notices: list[Notice]) -> None:
-        self._counts[joints] = rows["position"]
-        self._per_mille[joints] = rows["torque"]
-        states = STATE_TABLE[rows["statusword"] & STATE_BITS]
-        self._silent[joints] = 0
+    def _read_states(self, plan: _Plan, notices: list[Notice]) -> None:
+        joints = plan.joints
+        if not plan.complete:
+            self._silent[joints] = 0
+        seen = self._statusword.tobytes()
+        if seen == self._decoded:
+            return
+        statuswords = self._statusword[joints]
+        states = STATE_TABLE[statuswords & STATE_BITS]
         # What was handed out before stays as it was: new arrays for what changes.
         self._state = self._state.copy()
         known = states != UNDEFINED
         if np.count_nonzero(known) == len(known):
             self._state[joints] = states
+            self._decoded = seen
             return
+        self._decoded = b""
         self._state[joints[known]] = states[known]
-        for joint, word in zip(joints[~known].tolist(), rows["statusword"][~known].tolist(), strict=True):
+        for joint, word in zip(joints[~known].tolist(), statuswords[~known].tolist(), strict=True):
             text = f"joint {self._joints[joint]}: statusword {word:#06x} is no state of CiA 402; check the drive"
             notices.append(Notice("drive_fault", "error", text, joint, stops=True))
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from hal.errors import HalError
 from hal.profile import identifiers
 from hal.profile.cia402 import OperationMode
-from hal.profile.firmware import SMOOTHING, FirmwareGains, inverse_dead_zone
+from hal.profile.firmware import SMOOTHING, FirmwareGains, inverse_with_band, smoothing_band
 from hal.profile.frames import FRAME, FRAME_BYTES
 from hal.profile.objects import POSITION_LAYOUT, SERVO_LAYOUT, TORQUE_LAYOUT
 from hal.profile.units import DriveUnits
@@ -32,6 +32,35 @@ def operation_mode(mode: ControlMode) -> OperationMode:
     return OperationMode.CST if mode is ControlMode.TORQUE else OperationMode.CSP
 
 
+class Rpdos:
+    """One RPDO for each of some drives, made once and filled in every cycle.
+
+    Args:
+        can_ids: of the drives.
+        layout: of the data.
+        mode: of operation, for layouts that carry it.
+
+    """
+
+    def __init__(
+        self, can_ids: npt.NDArray[np.uint32], layout: np.dtype[np.void], mode: OperationMode | None = None
+    ) -> None:
+        assert layout.names is not None
+        assert layout.fields is not None
+        body = [(name, layout.fields[name][0]) for name in layout.names]
+        # Every byte belongs to a field: numpy does not promise to copy padding, and these bytes go on the bus.
+        fields = [("can_id", "<u4"), ("length", "u1"), ("pad", "V3"), *body, ("tail", f"V{8 - layout.itemsize}")]
+        if layout.itemsize == 8:
+            fields.pop()
+        self.frames: Frames = np.zeros(len(can_ids), np.dtype(fields))
+        self.columns: dict[str, npt.NDArray[np.integer]] = {name: self.frames[name] for name in layout.names}
+        """Fields of the data, each an array over the drives."""
+        self.frames["can_id"] = can_ids
+        self.frames["length"] = layout.itemsize
+        if mode is not None:
+            self.frames["mode"] = mode
+
+
 class Driver(ABC):
     """All drives of one kind of a robot; `joints` are their indices in the robot's order."""
 
@@ -43,11 +72,15 @@ class Driver(ABC):
         self.units = DriveUnits.of(description).select(joints)
         self.gains = FirmwareGains.of(description).select(joints)
         self._nodes = np.array([description.joints[index].drive.node_id for index in joints], dtype=np.uint32)
-        self._rpdo_position = self._blank(identifiers.RPDO1, POSITION_LAYOUT, OperationMode.CSP)
+        every = np.arange(len(description.joints))
+        self._own = slice(None) if np.array_equal(joints, every) else joints
+        self._rpdo_position = Rpdos(self._nodes + identifiers.RPDO1, POSITION_LAYOUT, OperationMode.CSP)
 
     @abstractmethod
     def encode(self, setpoint: Setpoint, controlwords: Controlwords) -> Frames:
         """Make one RPDO for each of the drives, in the order of `joints`: a structured array of 16-byte frames.
+
+        The next call may overwrite it.
 
         Args:
             setpoint: of the whole robot; its mode is one of `modes`.
@@ -55,26 +88,10 @@ class Driver(ABC):
         """
 
     def _position(self, setpoint: Setpoint, controlwords: Controlwords) -> Frames:
-        frames = self._rpdo_position.copy()
-        frames["controlword"] = controlwords[self.joints]
-        frames["position"] = self.units.counts_from_position(setpoint.target[self.joints])
-        return frames
-
-    def _blank(self, base: int, layout: np.dtype[np.void], mode: OperationMode | None = None) -> Frames:
-        """Prepare frames whose data fields are those of a PDO's layout."""
-        assert layout.names is not None
-        assert layout.fields is not None
-        body = [(name, layout.fields[name][0]) for name in layout.names]
-        # Every byte belongs to a field: numpy does not promise to copy padding, and these bytes go on the bus.
-        fields = [("can_id", "<u4"), ("length", "u1"), ("pad", "V3"), *body, ("tail", f"V{8 - layout.itemsize}")]
-        if layout.itemsize == 8:
-            fields.pop()
-        frames = np.zeros(len(self.joints), np.dtype(fields))
-        frames["can_id"] = self._nodes + base
-        frames["length"] = layout.itemsize
-        if mode is not None:
-            frames["mode"] = mode
-        return frames
+        rpdos = self._rpdo_position
+        rpdos.columns["controlword"][:] = controlwords[self._own]
+        rpdos.columns["position"][:] = self.units.counts_from_position(setpoint.target[self._own])
+        return rpdos.frames
 
 
 class PositionPD(Driver):
@@ -96,17 +113,18 @@ class Torque(Driver):
 
     def __init__(self, joints: npt.NDArray[np.intp], description: RobotDescription) -> None:
         super().__init__(joints, description)
-        self._rpdo_torque = self._blank(identifiers.RPDO2, TORQUE_LAYOUT, OperationMode.CST)
+        self._rpdo_torque = Rpdos(self._nodes + identifiers.RPDO2, TORQUE_LAYOUT, OperationMode.CST)
+        self._band = smoothing_band(self.gains.dead_zone, SMOOTHING)
 
     def encode(self, setpoint: Setpoint, controlwords: Controlwords) -> Frames:
         """RPDO1 {6040, 6060, 607A} or RPDO2 {6040, 6060, 6071}; the latter holds D⁻¹ of the torque to be delivered."""
         if setpoint.torque is None:
             return self._position(setpoint, controlwords)
-        frames = self._rpdo_torque.copy()
-        frames["controlword"] = controlwords[self.joints]
-        effort = inverse_dead_zone(setpoint.torque[self.joints], self.gains.dead_zone, SMOOTHING)
-        frames["torque"] = self.units.per_mille_from_torque(effort)
-        return frames
+        rpdos = self._rpdo_torque
+        rpdos.columns["controlword"][:] = controlwords[self._own]
+        effort = inverse_with_band(setpoint.torque[self._own], self.gains.dead_zone, self._band)
+        rpdos.columns["torque"][:] = self.units.per_mille_from_torque(effort)
+        return rpdos.frames
 
 
 class Servo(Driver):
@@ -117,16 +135,16 @@ class Servo(Driver):
 
     def __init__(self, joints: npt.NDArray[np.intp], description: RobotDescription) -> None:
         super().__init__(joints, description)
-        self._rpdo_servo = self._blank(identifiers.RPDO1, SERVO_LAYOUT)
+        self._rpdo_servo = Rpdos(self._nodes + identifiers.RPDO1, SERVO_LAYOUT)
 
     def encode(self, setpoint: Setpoint, controlwords: Controlwords) -> Frames:
         """RPDO1 {6040, 607A, 6072}."""
-        frames = self._rpdo_servo.copy()
-        frames["controlword"] = controlwords[self.joints]
-        frames["position"] = self.units.counts_from_position(setpoint.target[self.joints])
-        limit = self.gains.torque_limit if setpoint.torque_limit is None else setpoint.torque_limit[self.joints]
-        frames["max_torque"] = self.units.per_mille_from_limit(limit)
-        return frames
+        columns = self._rpdo_servo.columns
+        columns["controlword"][:] = controlwords[self._own]
+        columns["position"][:] = self.units.counts_from_position(setpoint.target[self._own])
+        limit = self.gains.torque_limit if setpoint.torque_limit is None else setpoint.torque_limit[self._own]
+        columns["max_torque"][:] = self.units.per_mille_from_limit(limit)
+        return self._rpdo_servo.frames
 
 
 DRIVERS: Final[dict[str, type[Driver]]] = {"position_pd": PositionPD, "torque": Torque, "servo": Servo}

@@ -10,6 +10,7 @@ stays what it was, whatever the true dead zone is. q_t less the commanded positi
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Final
 
 import numpy as np
@@ -30,20 +31,25 @@ class Predictor:
     """
 
     def __init__(self, positions: Array, period_s: float) -> None:
-        self._history = np.repeat(positions[None, :], HISTORY, axis=0)
+        self._history = deque([positions] * HISTORY, maxlen=HISTORY)
         self._period = period_s
         times = np.arange(1 - HISTORY, 1, dtype=np.float64)
         self._fit = np.linalg.pinv(np.vander(times, 3, increasing=True))
 
     def update(self, positions: Array) -> None:
-        """Append the positions [rad] of this cycle."""
-        self._history[:-1] = self._history[1:]
-        self._history[-1] = positions
+        """Append the positions [rad] of this cycle: kept, not copied."""
+        self._history.append(positions)
+
+    @property
+    def mean_velocity(self) -> Array:
+        """Over the last `HISTORY` samples (n,) [rad/s]."""
+        velocity: Array = (self._history[-1] - self._history[0]) / ((HISTORY - 1) * self._period)
+        return velocity
 
     def ahead(self, cycles: int) -> tuple[Array, Array]:
         """Position [rad] and velocity [rad/s] at `cycles` after the last update."""
         latest = self._history[-1]
-        constant, slope, curvature = self._fit @ (self._history - latest)
+        constant, slope, curvature = self._fit @ (np.array(self._history) - latest)
         position = latest + constant + slope * cycles + curvature * cycles**2
         return position, (slope + 2.0 * curvature * cycles) / self._period
 

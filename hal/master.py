@@ -11,7 +11,7 @@ from hal.boot import boot_network
 from hal.bus.gather import PortGroup
 from hal.bus.ports import FramePort, RecordingPort
 from hal.cycle import HalCore
-from hal.profile.frames import pack, view
+from hal.profile.frames import can_ids, pack
 from hal.profile.identifiers import HAL_NODE_ID, HEARTBEAT, SYNC
 from schemas.messages import BusFrames, JointCommand, RobotState
 from schemas.robot import RobotDescription
@@ -76,11 +76,7 @@ class Master:
         messages = []
         for bus, port in zip(self._robot.buses, self._ports, strict=True):
             sent, received = port.take()
-            messages.append(
-                BusFrames.model_construct(
-                    sequence=sequence, time_ns=time_ns, bus=bus.name, sent=sent, received=received
-                )
-            )
+            messages.append(BusFrames(sequence=sequence, time_ns=time_ns, bus=bus.name, sent=sent, received=received))
         return messages
 
     def close(self) -> None:
@@ -89,5 +85,5 @@ class Master:
 
     def _take(self, index: int, packet: bytes) -> bool:
         self._received[index].append(packet)
-        self._missing[index].difference_update(view(packet)["can_id"].tolist())
+        self._missing[index].difference_update(can_ids(packet))
         return not any(self._missing)

@@ -27,6 +27,8 @@ REPORT_TIMEOUT_S: Final = 1.0
 """Wall-clock wait in lockstep for the reports of a SYNC."""
 COMMAND_MARGIN: Final = 0.2
 """Share of the period before the next SYNC that is kept for the RPDOs (realtime)."""
+SIGNALLED: Final = 128
+"""Exit code, plus the signal's number, of a run that a signal cut short: the shells' convention."""
 SETTLE_S: Final = 0.1
 """Simulated time that the HAL stays beyond the hold's ramp when it stops a robot."""
 
@@ -46,13 +48,16 @@ class HalService:
         self._life = life
         self._keys = life.transport.keys
         self._realtime = run.scenario.clock is Clock.REALTIME
-        self._commands = life.transport.subscribe(self._keys.command, newest=self._realtime)
+        # Not only the newest: a foreign controller's command must not displace ours; late ones are passed over.
+        self._commands = life.transport.subscribe(self._keys.command)
         self._operator = life.transport.subscribe(self._keys.operator)
         self._meter = CycleMeter("hal", self._robot.period_s)
         self._sequence = 0
         self._next_sync_s = 0.0
         self._begun_s = 0.0
         self._last_error = ""
+        self._answered = False
+        self._missed_commands = 0
         for key in (self._keys.state, *(self._keys.bus(bus.name) for bus in self._robot.buses)):
             life.transport.declare_publisher(key)
 
@@ -82,7 +87,7 @@ class HalService:
             core.leave()
         self._hold(self._robot.command_delay_cycles + 1 if finished else self._ramp_cycles)
         if not finished and life.signalled is None:
-            raise SafeStopError(f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}")
+            raise SafeStopError(f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}") from core.cause
 
     @property
     def _ramp_cycles(self) -> int:
@@ -90,8 +95,8 @@ class HalService:
 
     def _cycle(self) -> None:
         """One period: SYNC, state out, command in, RPDOs out."""
-        sequence = self._sequence
         self._sync()
+        sequence = self._sequence
         state = self._master.gather(sequence, 0.5 * self._robot.period_s if self._realtime else REPORT_TIMEOUT_S)
         self._life.stamp(sequence, state.time_ns)
         self._life.publish(self._keys.state, state)
@@ -114,17 +119,23 @@ class HalService:
         """Send the SYNC when its time has come, then tell of the cycle before, while the drives answer."""
         frames = self._master.frames(self._sequence - 1)
         if self._realtime:
-            wait = self._next_sync_s - time.monotonic()
-            if wait > 0.0:
-                time.sleep(wait)
-            elif wait < -self._robot.period_s:
-                self._meter.late_cycles += 1
-                self._next_sync_s = time.monotonic()
-            self._next_sync_s += self._robot.period_s
+            self._await_sync_time()
         self._master.sync(self._sequence)
         for message in frames:
             self._life.publish(self._keys.bus(message.bus), message)
         self._publish_events()
+
+    def _await_sync_time(self) -> None:
+        """Sleep until the next SYNC's time on the absolute timer; SYNCs whose time has passed are left out."""
+        period = self._robot.period_s
+        wait = self._next_sync_s - time.monotonic()
+        if wait > 0.0:
+            time.sleep(wait)
+        late = max(time.monotonic() - self._next_sync_s, 0.0)
+        skipped = round(late / period)
+        self._meter.late_cycles += skipped
+        self._sequence += skipped
+        self._next_sync_s += (1 + skipped) * period
 
     def _await_command(self, sequence: int) -> JointCommand | None:
         """Wait for the answer to a state; None when it does not come in time, or the robot is stopped meanwhile."""
@@ -140,13 +151,19 @@ class HalService:
             life.check_peers()
             if data is not None:
                 command = self._decode(data)
-                if command is not None and core.accepts(command):
+                if command is not None and not self._is_late(command, sequence) and core.accepts(command):
+                    self._answered = True
                     return command
-            elif remaining <= 0.0:
-                if not self._realtime:
-                    core.stop(f"no command for sequence {sequence} in {self._robot.safety.command_timeout_s:g} s")
+            if remaining <= 0.0 and (data is None or remaining < -self._robot.period_s):
+                patience_s = self._robot.safety.command_timeout_s
+                if not self._realtime or (not self._answered and sequence * self._robot.period_s > patience_s):
+                    core.stop(f"no command for sequence {sequence} in {patience_s:g} s")
                 return None
         return None
+
+    def _is_late(self, command: JointCommand, sequence: int) -> bool:
+        """Whether an answer missed its cycle (realtime): it has been counted as missed and is no intruder's."""
+        return self._realtime and command.sequence < sequence and command.session == self._core.session
 
     def _decode(self, data: bytes) -> JointCommand | None:
         try:
@@ -164,6 +181,8 @@ class HalService:
                 self._core.stop(str(error), emergency=True)
                 return
             if request.action == "stop":
+                if self._core.status is HalStatus.EMERGENCY_STOP:
+                    self._life.event("emergency_stop", "it is latched already; the HAL holds", "warning")
                 self._core.stop(request.reason or "operator", emergency=True)
             else:
                 self._core.reset()
@@ -178,8 +197,10 @@ class HalService:
         now = time.monotonic()
         self._meter.cycle(now - self._begun_s)
         self._begun_s = now
-        self._meter.missed_commands = self._core.missed_commands
-        if (summary := self._meter.report(state.sequence, state.time_ns, now)) is not None:
+        self._meter.missed_commands += self._core.missed_commands - self._missed_commands
+        self._missed_commands = self._core.missed_commands
+        last = self._sequence >= self._run.cycles
+        if (summary := self._meter.report(state.sequence, state.time_ns, now, final=last)) is not None:
             self._life.publish(self._keys.health, summary)
 
 
@@ -203,4 +224,4 @@ def run_hal(run: Run, options: ServiceOptions) -> int:
             service.run()
         finally:
             master.close()
-    return 0
+    return 0 if life.signalled is None else SIGNALLED + life.signalled

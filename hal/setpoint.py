@@ -17,7 +17,7 @@ HAL_DECIDED: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """An offset [rad] that holds a torque in the position modes and ramps to zero by `ramp_share`, over a number of cycles."""
+    """An offset [rad] that holds a torque in the position modes; it ramps to zero by `ramp_share` over some cycles."""
 
     entry: Array
     cycles: int
@@ -60,7 +60,7 @@ class Setpoint:
 
     def applied(self) -> AppliedCommand:
         """Make the message that reports it."""
-        return AppliedCommand.model_construct(
+        return AppliedCommand(
             sequence=self.sequence,
             mode=self.mode,
             position=None if self.position is None else vector(self.target),

@@ -24,6 +24,9 @@ class Supervisor:
         self._patience = robot.safety.sync_timeout_cycles
         self._count = count
         self._wrong_mode = np.zeros(count, dtype=np.int64)
+        self._right: tuple[npt.NDArray[np.int8], OperationMode] | None = None
+        """Modes reported and commanded that were found to agree last."""
+        self._states: npt.NDArray[np.int8] | None = None
         self._silent_sensors: frozenset[str] = frozenset()
         self.all_enabled = True
         """Every drive is in Operation Enabled."""
@@ -53,6 +56,9 @@ class Supervisor:
         return notices
 
     def _review_states(self, measured: Measured, notices: list[Notice]) -> None:
+        if measured.drive_state is self._states:
+            return
+        self._states = measured.drive_state
         before, self.enabled = self.enabled, measured.drive_state == _ENABLED
         all_before, self.all_enabled = self.all_enabled, np.count_nonzero(self.enabled) == self._count
         if all_before and self.all_enabled:
@@ -80,10 +86,15 @@ class Supervisor:
         self.silent_joints = frozenset(silent)
 
     def _review_modes(self, measured: Measured, mode: OperationMode, notices: list[Notice]) -> None:
+        right = self._right
+        if right is not None and measured.mode is right[0] and mode is right[1]:
+            return
         wrong = measured.mode != int(mode)
         if not np.count_nonzero(wrong):
             self._wrong_mode[:] = 0
+            self._right = measured.mode, mode
             return
+        self._right = None
         wrong &= self.enabled
         self._wrong_mode = np.where(wrong, self._wrong_mode + 1, 0)
         for joint in np.flatnonzero(self._wrong_mode == self._patience).tolist():
@@ -94,6 +105,8 @@ class Supervisor:
             notices.append(Notice("mode_refused", "error", text, joint, stops=True))
 
     def _review_sensors(self, ages: dict[str, int], notices: list[Notice]) -> None:
+        if not self._silent_sensors and max(ages.values(), default=0) < self._patience:
+            return
         silent = frozenset(name for name, age in ages.items() if age >= self._patience)
         if silent == self._silent_sensors:
             return

@@ -29,6 +29,7 @@ MOTOR_NOISE_STREAM = 2
 OFF = int(OperationMode.NONE)
 POSITION = int(OperationMode.CSP)
 TORQUE = int(OperationMode.CST)
+UNKNOWN = -1
 
 
 class Firmware:
@@ -62,6 +63,8 @@ class Firmware:
         """Set when a brake engages or releases; cleared by whoever has taken note."""
         self.torque = np.zeros(n)
         """τ of the last step: nominal motor torque at the joint, after dead zone and limit."""
+        self.constant = False
+        """No joint has a position loop in this period: `torque` holds for all its substeps."""
         self._limit = self._own_limit.copy()
         self._minus_limit = -self._limit
         self._minus_dead_zone = -self._dead_zone
@@ -75,59 +78,65 @@ class Firmware:
         self._hold_offset = np.zeros(n)
         self._hold_final = np.zeros(n)
         self._hold_elapsed = np.zeros(n)
-        self._encoder = np.zeros(n)
         self._velocity = np.zeros(n)
         self._fractions = np.arange(substeps)[:, np.newaxis] / substeps
         self._bias = np.zeros((substeps, n))
         self._count_stiffness = np.zeros(n)
-        self._effort = np.zeros(n)
-        self._term = np.zeros(n)
         self.counts: list[int] = [0] * n
         self.per_mille: list[int] = [0] * n
 
+        # Each drive sets its own joint at every SYNC: single numbers cost half as much in a memory view or a list.
+        self._mode_of = self.mode.data
+        self._target_of = _numbers(self._target)
+        self._goal_of = _numbers(self._goal)
+        self._target_velocity_of = _numbers(self._target_velocity)
+        self._feedforward_of = _numbers(self._feedforward)
+        self._zero_of: list[float] = self._units.zero_offset.tolist()
+        self._radian_of: list[float] = self._units.radian_per_count.tolist()
+        self._newton_metre_of: list[float] = self._units.newton_metre_per_mille.tolist()
+        self._followed = [OFF] * n
+        """Mode in which a joint follows set-points, its law set and its brake released; 0 while it does not."""
+        self._limited_to = [UNKNOWN] * n
+        """Limit of the last set-point [‰]."""
+
     def begin_period(self) -> None:
         """Lay out the coming period: what of x does not depend on the measurement, for every substep at once."""
+        self.constant = POSITION not in self.mode.tolist()
+        if self.constant:
+            self.torque = self._torque_of(self._feedforward)
+            return
         zero, resolution = self._units.zero_offset, self._units.radian_per_count
         targets = self._target + self._fractions * (self._goal - self._target)
         self._bias = self._stiffness * (targets - zero) + self._damping * self._target_velocity + self._feedforward
         self._count_stiffness = self._stiffness * resolution
 
     def step(self, substep: int, position: Array, velocity: Array) -> Array:
-        """Nominal motor torques [N·m] at true joint positions and velocities, shape (n,), in one substep of the period.
+        """Motor torques [N·m] in one substep of the period, at true joint positions and velocities, shape (n,)."""
+        if not self.constant:
+            # Counts as the drive reads them; k_p (zero + counts · resolution) is split between here and the bias.
+            counts = np.rint((position - self._units.zero_offset) / self._units.radian_per_count)
+            effort = self._bias[substep] - counts * self._count_stiffness - velocity * self._damping
+            self.torque = self._torque_of(effort)
+        return self.torque
 
-        The array returned is overwritten by the next call.
-        """
-        effort, term, torque = self._effort, self._term, self.torque
-        # Encoder counts as the drive reads them; k_p (zero + counts · resolution) is split between here and the bias.
-        np.subtract(position, self._units.zero_offset, out=term)
-        np.divide(term, self._units.radian_per_count, out=term)
-        np.rint(term, out=term)
-        np.multiply(term, self._count_stiffness, out=term)
-        np.subtract(self._bias[substep], term, out=effort)
-        np.multiply(velocity, self._damping, out=term)
-        np.subtract(effort, term, out=effort)
-
-        np.minimum(effort, self._dead_zone, out=term)
-        np.maximum(term, self._minus_dead_zone, out=term)
-        np.subtract(effort, term, out=torque)
-        np.minimum(torque, self._limit, out=torque)
-        np.maximum(torque, self._minus_limit, out=torque)
-        return torque
+    def _torque_of(self, effort: Array) -> Array:
+        """τ of x: dead zone and limit."""
+        torque = effort - np.maximum(np.minimum(effort, self._dead_zone), self._minus_dead_zone)
+        limited: Array = np.maximum(np.minimum(torque, self._limit), self._minus_limit)
+        return limited
 
     def end_period(self, position: Array, velocity: Array) -> None:
         """Close the interpolation at SYNC and sample encoder, velocity and current at the true state, shape (n,)."""
         self._target[:] = self._goal
-        self._target_velocity[:] = 0.0
+        self._target_velocity.fill(0.0)
         if self._held:
             self._advance_holding()
         self.sample(position, velocity)
 
     def sample(self, position: Array, velocity: Array) -> None:
         """Sample encoder, velocity and current at the true state, shape (n,)."""
-        counts = self._units.counts_from_position(position)
-        self._encoder = self._units.position_from_counts(counts)
+        self.counts = self._units.counts_from_position(position).tolist()
         self._velocity[:] = velocity
-        self.counts = counts.tolist()
         reported = self.torque
         if self._noise > 0.0:
             reported = reported + self._noise * self._generator.standard_normal(len(reported))
@@ -142,20 +151,27 @@ class Firmware:
 
     def follow_position(self, joint: int, counts: int, max_per_mille: int) -> None:
         """Mode 8: move to a target [counts] over one period; on entry into the mode jump there."""
-        units = self._units
-        goal = float(units.zero_offset[joint]) + counts * float(units.radian_per_count[joint])
-        start = float(self._target[joint]) if self.mode[joint] == POSITION else goal
-        self._set_law(joint, POSITION, self._position_gain[joint], self._velocity_gain[joint], 0.0)
-        self._move_target(joint, start, goal, (goal - start) / self._period_s)
-        self._set_limit(joint, self._limit_of(joint, max_per_mille))
-        self._release(joint)
+        goal = self._zero_of[joint] + counts * self._radian_of[joint]
+        if self._followed[joint] == POSITION:
+            start = self._target_of[joint]
+        else:
+            start = self._target_of[joint] if self._mode_of[joint] == POSITION else goal
+            self._target_of[joint] = start
+            self._set_law(joint, POSITION, self._position_gain[joint], self._velocity_gain[joint], 0.0)
+            self._follow(joint, POSITION)
+        self._goal_of[joint] = goal
+        self._target_velocity_of[joint] = (goal - start) / self._period_s
+        if max_per_mille != self._limited_to[joint]:
+            self._limit_to(joint, max_per_mille)
 
     def follow_torque(self, joint: int, per_mille: int, max_per_mille: int) -> None:
         """Mode 10: give a torque [‰ of rated] from now on."""
-        torque = per_mille * float(self._units.newton_metre_per_mille[joint])
-        self._set_law(joint, TORQUE, 0.0, 0.0, torque)
-        self._set_limit(joint, self._limit_of(joint, max_per_mille))
-        self._release(joint)
+        if self._followed[joint] != TORQUE:
+            self._set_law(joint, TORQUE, 0.0, 0.0, 0.0)
+            self._follow(joint, TORQUE)
+        self._feedforward_of[joint] = per_mille * self._newton_metre_of[joint]
+        if max_per_mille != self._limited_to[joint]:
+            self._limit_to(joint, max_per_mille)
 
     def hold(self, joint: int) -> None:
         """Hold: take the target at which the position loop gives the torque now acting, then ramp its offset to zero.
@@ -169,9 +185,10 @@ class Firmware:
         gains = FirmwareGains(
             self._position_gain[one], self._velocity_gain[one], self._dead_zone[one], self._limit[one]
         )
-        start = float(self._encoder[joint]) + holding_offset(self.torque[one], self._velocity[one], gains).item()
+        encoder = self._zero_of[joint] + self.counts[joint] * self._radian_of[joint]
+        start = encoder + holding_offset(self.torque[one], self._velocity[one], gains).item()
         was_off = self.mode[joint] == OFF
-        final = float(self._target[joint]) if self.mode[joint] == POSITION else float(self._encoder[joint])
+        final = float(self._target[joint]) if self.mode[joint] == POSITION else encoder
         self._set_law(joint, POSITION, self._position_gain[joint], self._velocity_gain[joint], 0.0)
         if was_off:
             self._set_limit(joint, float(self._own_limit[joint]))
@@ -206,6 +223,8 @@ class Firmware:
             scale = self._units.newton_metre_per_mille.copy()
             scale[joint] = np.copysign(gains.rated_motor_torque * self._gear[joint] / 1000.0, scale[joint])
             self._units = dataclasses.replace(self._units, newton_metre_per_mille=scale)
+            self._newton_metre_of = scale.tolist()
+            self._limited_to[joint] = UNKNOWN
         if self.mode[joint] == POSITION:
             self._stiffness[joint] = self._position_gain[joint]
             self._damping[joint] = self._velocity_gain[joint]
@@ -216,6 +235,11 @@ class Firmware:
         self._damping[joint] = damping
         self._feedforward[joint] = feedforward
         self._held.discard(joint)
+        self._followed[joint] = OFF
+
+    def _follow(self, joint: int, mode: int) -> None:
+        self._followed[joint] = mode
+        self._release(joint)
 
     def _move_target(self, joint: int, start: float, goal: float, velocity: float) -> None:
         self._target[joint] = start
@@ -226,9 +250,11 @@ class Firmware:
         limit = min(float(self._own_limit[joint]), limit)
         self._limit[joint] = limit
         self._minus_limit[joint] = -limit
+        self._limited_to[joint] = UNKNOWN
 
-    def _limit_of(self, joint: int, per_mille: int) -> float:
-        return per_mille * abs(float(self._units.newton_metre_per_mille[joint]))
+    def _limit_to(self, joint: int, per_mille: int) -> None:
+        self._set_limit(joint, per_mille * abs(self._newton_metre_of[joint]))
+        self._limited_to[joint] = per_mille
 
     def _release(self, joint: int) -> None:
         if self.braked[joint]:
@@ -244,3 +270,7 @@ class Firmware:
         for joint in self._held:
             self._hold_elapsed[joint] += self._period_s
             self._move_target(joint, float(self._target[joint]), self._ramped(joint), 0.0)
+
+
+def _numbers(array: Array) -> memoryview[float]:
+    return array.data.cast("B").cast("d")

@@ -36,7 +36,6 @@ class DryFriction:
         self._exponent = -np.square(gear_ratio / friction.stribeck_velocity)
         self._brake_torque = BRAKE_FACTOR * torque_limit
         self._offset = self._coulomb + self._brake_torque
-        self._bound = np.empty_like(self._coulomb)
         self.set_brakes(np.ones(len(gear_ratio), dtype=bool))
 
     def set_brakes(self, engaged: NDArray[np.bool_]) -> None:
@@ -44,11 +43,6 @@ class DryFriction:
         np.add(self._coulomb, np.where(engaged, self._brake_torque, 0.0), out=self._offset)
 
     def bound(self, velocity: Array) -> Array:
-        """F [N·m] at joint velocities [rad/s], shape (n,); the array returned is overwritten by the next call."""
-        bound = self._bound
-        np.multiply(velocity, velocity, out=bound)
-        np.multiply(bound, self._exponent, out=bound)
-        np.exp(bound, out=bound)
-        np.multiply(bound, self._excess, out=bound)
-        np.add(bound, self._offset, out=bound)
+        """F [N·m] at joint velocities [rad/s], shape (n,)."""
+        bound: Array = np.exp(velocity * velocity * self._exponent) * self._excess + self._offset
         return bound

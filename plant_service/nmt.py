@@ -9,6 +9,7 @@ from hal.profile import frames, identifiers
 from hal.profile.objects import CONSUMER_HEARTBEAT, PRODUCER_HEARTBEAT_MS
 from plant_service.object_dictionary import DeviceDictionary, key_of
 
+NEVER_NS: Final = 2**63
 K_PRODUCER: Final = key_of(PRODUCER_HEARTBEAT_MS)
 K_CONSUMER: Final = key_of(CONSUMER_HEARTBEAT, 1)
 
@@ -66,6 +67,14 @@ class HeartbeatProducer:
         self._nmt = nmt
         self._sent_ns: int | None = None
 
+    @property
+    def due_ns(self) -> int:
+        """Time of the next heartbeat."""
+        period_ns = self._values[K_PRODUCER] * 1_000_000
+        if period_ns == 0:
+            return NEVER_NS
+        return 0 if self._sent_ns is None else int(self._sent_ns + period_ns)
+
     def tick(self, now_ns: int) -> bytes | None:
         """Give the heartbeat if it is due; the first one comes a period after the producer was configured."""
         period_ns = self._values[K_PRODUCER] * 1_000_000
@@ -100,6 +109,14 @@ class HeartbeatConsumer:
         entry = self._values[K_CONSUMER]
         node_id = entry >> 16 & 0x7F
         return identifiers.HEARTBEAT + node_id if node_id and entry & 0xFFFF else 0
+
+    @property
+    def due_ns(self) -> int:
+        """Time at which the watched node is lost if it is not heard before."""
+        time_ns = (self._values[K_CONSUMER] & 0xFFFF) * 1_000_000
+        if self._heard_ns is None or self.lost or time_ns == 0:
+            return NEVER_NS
+        return int(self._heard_ns + time_ns)
 
     def hear(self, now_ns: int) -> bool:
         """Note a heartbeat of the watched node. Returns whether it had been lost."""

@@ -67,7 +67,9 @@ class Pdo:
         self.keys: tuple[int, ...] = ()
         self.codec = struct.Struct("<")
         self.synchronous = True
-        """Sent after, or acting at, a SYNC; otherwise event-driven."""
+        """Sent after, or acting at, a SYNC."""
+        self.event_driven = False
+        """Sent when it changes or when its event timer runs out; an RPDO acts at once."""
         self.inhibit_ns = 0
         """Shortest time between two event-driven transmissions."""
         self.event_timer_ns = 0
@@ -92,6 +94,7 @@ class Pdo:
         self.can_id = cob_id & CAN_ID_BITS
         self.type = values[key_of(self._communication, 2)]
         self.synchronous = self.type <= LAST_CYCLIC_TYPE
+        self.event_driven = self.type in EVENT_TYPES
         self.inhibit_ns = values[key_of(self._communication, 3)] * 100_000
         self.event_timer_ns = values[key_of(self._communication, 5)] * 1_000_000
         count = values[key_of(self._mapping, 0)]
@@ -179,7 +182,9 @@ class Tpdo(Pdo):
     def __init__(self, dictionary: DeviceDictionary, number: int, changed: Callable[[], None]) -> None:
         self.last: bytes | None = None
         """Frame sent last; None: never since the PDO became valid."""
-        self.sent_ns = 0
+        self._selected: tuple[Any, ...] = ()
+        """Values in `last`."""
+        self._sent_ns = 0
         self._syncs = 0
         self._values = dictionary.values
         self._select: Callable[[dict[int, Any]], tuple[Any, ...]] = _nothing
@@ -203,24 +208,39 @@ class Tpdo(Pdo):
         """Frame of 16 bytes with the mapped objects as they are now."""
         return self._frame.pack(self.can_id, self.codec.size, *self._select(self._values))
 
-    def due_at_sync(self, frame: bytes, now_ns: int) -> bool:
-        """Whether this SYNC asks for a transmission; counts the SYNC."""
-        if self.type == 0:
-            return frame != self.last
-        if self.synchronous:
+    def at_sync(self, now_ns: int) -> bytes | None:
+        """Frame that this SYNC asks for, if it asks for one; counts the SYNC."""
+        if self.type == 1:
+            return self.pack()
+        if self.event_driven:
+            return self.by_event(now_ns)
+        if self.synchronous and self.type:
             self._syncs += 1
             if self._syncs < self.type:
-                return False
+                return None
             self._syncs = 0
-            return True
-        return self.due_by_event(frame, now_ns)
+            return self.pack()
+        return self._changed_frame() if self.type == 0 else None
 
-    def due_by_event(self, frame: bytes, now_ns: int) -> bool:
-        """Whether an event-driven PDO changed, or its event timer ran out, and its inhibit time is over."""
-        if self.type not in EVENT_TYPES:
-            return False
-        if self.last is None:
-            return True
-        age = now_ns - self.sent_ns
-        timer = self.event_timer_ns
-        return (frame != self.last and age >= self.inhibit_ns) or (timer > 0 and age >= timer)
+    def by_event(self, now_ns: int) -> bytes | None:
+        """Frame of an event-driven PDO that has changed, its inhibit time over, or whose event timer ran out."""
+        if not self.event_driven:
+            return None
+        age, timer = now_ns - self._sent_ns, self.event_timer_ns
+        if self.last is not None and timer > 0 and age >= timer:
+            self.last = None
+        elif self.last is not None and age < self.inhibit_ns:
+            return None
+        frame = self._changed_frame()
+        if frame is not None:
+            self._sent_ns = now_ns
+        return frame
+
+    def _changed_frame(self) -> bytes | None:
+        """Frame to send unless it is the one sent last."""
+        selected = self._select(self._values)
+        if self.last is not None and selected == self._selected:
+            return None
+        self.last = self._frame.pack(self.can_id, self.codec.size, *selected)
+        self._selected = selected
+        return self.last

@@ -106,9 +106,13 @@ def frame_identifier(frame: bytes) -> int:
 
 
 class Plant:
-    """Simulation and devices of a run. Time 0 is the first SYNC."""
+    """Simulation and devices of a run. Time 0 is the first SYNC.
 
-    def __init__(self, run: Run) -> None:
+    With `free`, time passes by `advance` alone and masters send SYNC when and on which bus they like: the order of a
+    cycle is then `advance` → `deliver`, as soon as the first SYNC of a sequence arrives.
+    """
+
+    def __init__(self, run: Run, *, free: bool = False) -> None:
         self._robot = run.robot.description
         self.simulation = Simulation(run.robot, run.scenario.plant, run.scenario.seed)
         self.drives = tuple(
@@ -118,8 +122,10 @@ class Plant:
         self._buses = [BusNodes(self._devices_of(bus.name)) for bus in self._robot.buses]
         self._synced = [False] * len(self._buses)
         self._now_ns = self.simulation.time_ns
+        self._free = free
+        self._origin_ns = 0
         self.sequence = -1
-        """Of the SYNC that came last on any bus; −1 before the first."""
+        """Of the SYNC that came last on any bus, with `free` the periods since the first; −1 before the first."""
 
     @property
     def time_ns(self) -> int:
@@ -152,7 +158,10 @@ class Plant:
 
     def truth(self) -> PlantTruth:
         """Report the robot as it really is at the present SYNC."""
-        return self.simulation.truth(max(self.sequence, 0), tuple(drive.state for drive in self.drives))
+        truth = self.simulation.truth(max(self.sequence, 0), tuple(drive.state for drive in self.drives))
+        if self._origin_ns:
+            return truth.model_copy(update={"time_ns": truth.time_ns - self._origin_ns})
+        return truth
 
     def advance(self) -> None:
         """Integrate one period, then let the time act on the devices; the next SYNC may come."""
@@ -161,6 +170,14 @@ class Plant:
         for bus in self._buses:
             bus.tick(now_ns)
         self._synced = [False] * len(self._buses)
+        if self._free and self.sequence >= 0:
+            self.sequence += 1
+
+    def skip(self, periods: int) -> None:
+        """Leave out periods that there was no time to simulate (`free`): what follows keeps its place in time."""
+        if self.sequence >= 0:
+            self.sequence += periods
+            self._origin_ns -= periods * self._robot.period_ns
 
     def free_run(self) -> tuple[bytes, ...]:
         """Integrate one period without SYNC; what the nodes of each bus say on their own, to be sent at once."""
@@ -172,6 +189,10 @@ class Plant:
         return tuple(bus.collect([]) for bus in self._buses)
 
     def _count_sync(self, bus_index: int) -> None:
+        if self._free:
+            if self.sequence < 0:
+                self.sequence, self._origin_ns = 0, self._now_ns
+            return
         if self._synced[bus_index]:
             missing = [bus.name for bus, synced in zip(self._robot.buses, self._synced, strict=True) if not synced] or [
                 "none: the plant was not advanced"

@@ -14,6 +14,7 @@ from plant_service.errors import DivergedError, PlantError
 from plant_service.firmware import Firmware
 from plant_service.friction import DryFriction
 from plant_service.joint_axis import JointAxis
+from plant_service.joint_entries import JointEntries
 from plant_service.model import PlantModel, build
 from plant_service.sensors import Sensors
 from schemas.load import Robot
@@ -41,6 +42,7 @@ class Simulation:
         self._model = self._plant.model
         self._data = mujoco.MjData(self._model)
         self._warnings = self._data.warning.number
+        self._torque_scale = np.array(config.torque_scale)  # numpy takes a Python number at twice the cost
         self._substeps = round(description.period_s / config.substep_s)
         joints = description.joints
         gear = np.array([joint.gear_ratio for joint in joints])
@@ -50,7 +52,10 @@ class Simulation:
         """One axis a joint, for the simulated drives."""
         self.sensors = Sensors(description, self._model, config.noise, seed)
         """Readings of the last sample."""
-        self._frames = self._truth_frames()
+        body_of = self._plant.frame_bodies
+        self._frames = {
+            name: (self._data.xpos[body_of[name]], self._data.xquat[body_of[name]]) for name in self._truth_frames()
+        }
         self._loads: dict[str, tuple[Array, Array]] = {}
 
         self._position = np.array(self._plant.initial_position)
@@ -62,16 +67,23 @@ class Simulation:
         self._contact_force = 0.0
         self._periods = 0
 
-        self._joints = _as_slice(self._plant.qpos_address)
-        self._dofs = _as_slice(self._plant.dof_address)
-        self._data.qpos[self._joints] = self._position
-        self._sensors_on = self._model.opt.disableflags
+        model, data, dofs = self._model, self._data, self._plant.dof_address
+        self._joint_position = JointEntries(data.qpos, self._plant.qpos_address)
+        self._joint_velocity = JointEntries(data.qvel, dofs)
+        self._joint_applied = JointEntries(data.qfrc_applied, dofs)
+        self._joint_constraint = JointEntries(data.qfrc_constraint, dofs)
+        self._joint_friction = JointEntries(model.dof_frictionloss, dofs)
+        self._joint_damping = JointEntries(model.dof_damping, dofs)
+        self._joint_position.write(self._position)
+        self._options = model.opt
+        self._sensordata = data.sensordata
+        self._sensors_on = model.opt.disableflags
         self._sensors_off = self._sensors_on | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._apply_brakes()
         mujoco.mj_forward(self._model, self._data)
         self._sample_constraints(self._velocity)
         self._firmware.sample(self._position, self._velocity)
-        self.sensors.sample(self._data.sensordata)
+        self.sensors.sample(self._sensordata)
 
     @property
     def time_ns(self) -> int:
@@ -116,38 +128,41 @@ class Simulation:
 
         """
         model, data, firmware = self._model, self._data, self._firmware
-        qpos, qvel, qfrc, loss = data.qpos, data.qvel, data.qfrc_applied, model.dof_frictionloss
-        joints, dof = self._joints, self._dofs
-        scale = self._config.torque_scale
+        step1, step2 = mujoco.mj_step1, mujoco.mj_step2
+        scale = self._torque_scale
         self._mode[:] = firmware.mode
         self._apply_loads()
         if firmware.brakes_changed:
             self._apply_brakes()
-            mujoco.mj_step1(model, data)
+            step1(model, data)
         firmware.begin_period()
         torques = np.empty((self._substeps, len(self.axes)))
+        if firmware.constant:
+            torques[:] = firmware.torque * scale
+            self._joint_applied.write(torques[0])
         position, velocity = self._position, self._velocity
         last = self._substeps - 1
-        model.opt.disableflags = self._sensors_off
+        self._options.disableflags = self._sensors_off
         for index, torque in enumerate(torques):
-            np.multiply(firmware.step(index, position, velocity), scale, out=torque)
-            qfrc[dof] = torque
+            if not firmware.constant:
+                torque[:] = firmware.step(index, position, velocity) * scale
+                self._joint_applied.write(torque)
             if index == last:
-                model.opt.disableflags = self._sensors_on
+                self._options.disableflags = self._sensors_on
                 previous = velocity.copy()
-            mujoco.mj_step2(model, data)
-            position, velocity = qpos[joints], qvel[dof]
+            step2(model, data)
+            position, velocity = self._joint_position.read(), self._joint_velocity.read()
             if index == last:
                 self._sample_constraints(previous)
-            loss[dof] = self._friction.bound(velocity)
-            mujoco.mj_step1(model, data)
+            self._joint_friction.write(self._friction.bound(velocity))
+            step1(model, data)
         self._acceleration = (velocity - previous) / self._config.substep_s
         self._position, self._velocity, self._motor_torque = position, velocity, torques
         self._periods += 1
         if np.count_nonzero(self._warnings):
             self._raise_diverged()
         firmware.end_period(position, velocity)
-        self.sensors.sample(data.sensordata)
+        self.sensors.sample(self._sensordata)
 
     def truth(self, sequence: int, drive_states: Sequence[DriveState]) -> PlantTruth:
         """Tell what is true at this SYNC.
@@ -168,7 +183,7 @@ class Simulation:
             motor_torque=tuple(now.tolist()),
             motor_torque_substeps=tuple(map(tuple, torques.tolist())),
             friction_torque=tuple(self._friction_torque.tolist()),
-            frames={name: self.pose(name) for name in self._frames},
+            frames={name: _pose(*views) for name, views in self._frames.items()},
             sensor_wrenches=dict(self.sensors.true_wrenches),
             contact_force=self._contact_force,
             kinetic_energy=self.kinetic_energy,
@@ -177,9 +192,7 @@ class Simulation:
     def pose(self, link: str) -> PoseSample:
         """Tell the true pose of a URDF link's frame in the world."""
         body = self._plant.frame_bodies[link]
-        x, y, z = self._data.xpos[body].tolist()
-        quaternion = self._data.xquat[body].tolist()
-        return PoseSample(position_in_world=(x, y, z), orientation_to_world=quaternion)
+        return _pose(self._data.xpos[body], self._data.xquat[body])
 
     def _truth_frames(self) -> tuple[str, ...]:
         hand = self._description.hand_frame
@@ -187,7 +200,7 @@ class Simulation:
 
     def _apply_brakes(self) -> None:
         self._friction.set_brakes(self._firmware.braked)
-        self._model.dof_frictionloss[self._dofs] = self._friction.bound(self._velocity)
+        self._joint_friction.write(self._friction.bound(self._velocity))
         self._firmware.brakes_changed = False
 
     def _apply_loads(self) -> None:
@@ -209,15 +222,14 @@ class Simulation:
     def _sample_constraints(self, velocity: Array) -> None:
         """Take friction and contact forces while the constraint solution still stands."""
         data, model = self._data, self._model
-        dof = self._dofs
         if data.nefc == data.nf:
-            dry = data.qfrc_constraint[dof]
+            dry = self._joint_constraint.read()
         else:
             rows = slice(data.ne, data.ne + data.nf)
             every = np.zeros(model.nv)
             every[data.efc_id[rows]] = data.efc_force[rows]
-            dry = every[dof]
-        self._friction_torque = dry - model.dof_damping[dof] * velocity
+            dry = every[self._plant.dof_address]
+        self._friction_torque = dry - self._joint_damping.read() * velocity
         self._contact_force = 0.0
         contacts = data.ncon
         if contacts == 0:
@@ -228,7 +240,5 @@ class Simulation:
             self._contact_force += float(np.linalg.norm(wrench[:3]))
 
 
-def _as_slice(indices: NDArray[np.intp]) -> slice | NDArray[np.intp]:
-    """Consecutive indices as a slice, which costs a fifth."""
-    first, count = int(indices[0]), len(indices)
-    return slice(first, first + count) if (indices == np.arange(first, first + count)).all() else indices
+def _pose(position: Array, quaternion: Array) -> PoseSample:
+    return PoseSample(position_in_world=tuple(position.tolist()), orientation_to_world=tuple(quaternion.tolist()))

@@ -11,7 +11,8 @@ SYNC_BYTES = 0
 STATE_BYTES = 8
 """TPDO1 {6041, 6064, 6077}."""
 MODE_BYTES = 3
-"""TPDO2 {6061, 603F}, sent on change: counted once a cycle for every drive, the worst case of a mode switch."""
+"""TPDO2 {6061, 603F}, sent on change: in the worst cycle, a mode switch, by every drive that has two modes of
+operation; on a bus whose drives have mode 8 alone, by the one whose error changes."""
 COMMAND_BYTES = {"position_pd": 7, "torque": 7, "servo": 8}
 """The longest RPDO of each kind."""
 FORCE_TORQUE_BYTES = (8, 8)
@@ -75,7 +76,8 @@ def bus_loads(robot: RobotDescription) -> tuple[BusLoad, ...]:
     loads = []
     for bus in robot.buses:
         drives = [joint.drive for joint in robot.joints if joint.drive.bus == bus.name]
-        reports = [("TPDO1", STATE_BYTES) for _ in drives] + [("TPDO2", MODE_BYTES) for _ in drives]
+        changing = [drive for drive in drives if drive.kind == "torque"] or drives[:1]
+        reports = [("TPDO1", STATE_BYTES) for _ in drives] + [("TPDO2", MODE_BYTES) for _ in changing]
         for sensor in robot.force_torque_sensors:
             if sensor.bus == bus.name:
                 reports += [("F/T", size) for size in FORCE_TORQUE_BYTES]

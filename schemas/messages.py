@@ -212,7 +212,11 @@ class CycleStatistics(Model):
     time_ns: int
     cycles: int
     cycle_time_median_s: float
+    cycle_time_p99_s: float
     cycle_time_max_s: float
+    cycle_time_counts: tuple[tuple[int, int], ...] = ()
+    """Histogram as pairs (bin, cycles) in the order of the bins: bin b holds durations from 10^(b/100) µs to
+    10^((b+1)/100) µs, 2.3 % wide; the counts of several messages may be added (`schemas.statistics.percentile`)."""
     late_cycles: int = 0
     missed_commands: int = 0
     real_time_factor: float

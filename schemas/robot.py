@@ -124,8 +124,9 @@ class Safety(Model):
 
     missed_commands: PositiveInt = 5
     """Cycles in a row without a valid command after which the HAL stops (realtime clock)."""
-    command_timeout_s: PositiveFloat = 1.0
-    """Wall-clock wait in lockstep for a controller that hangs, before the safe stop; one that died shows sooner."""
+    command_timeout_s: PositiveFloat = 5.0
+    """Wall-clock wait in lockstep for a controller that hangs, before the safe stop; one that died shows at once, so
+    this is long enough for a machine that is busy with other things."""
     sync_timeout_cycles: PositiveInt = 5
     """Cycles without SYNC or RPDO after which a drive holds by its own means."""
     hold_ramp_s: PositiveFloat = 0.2

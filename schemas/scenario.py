@@ -54,9 +54,9 @@ class PlantConfig(Model):
     """True dead zone over the described one."""
     friction: Friction = Friction()
     noise: SensorNoise = SensorNoise()
-    free_run_after_s: PositiveFloat = 1.0
+    free_run_after_s: PositiveFloat = 10.0
     """Lockstep: wall-clock silence of the bus after which the plant runs on by itself so that drives notice a HAL that
-    hangs; one that died is noticed at once."""
+    hangs; one that died is noticed at once. Longer than the HAL waits for a command (`safety.command_timeout_s`)."""
     initial_posture: dict[str, float] = Field(default_factory=dict)
     """Joint angles [rad] at the start; joints not named start at 0 or the nearest limit."""
     truth_frames: tuple[str, ...] = ()

@@ -27,7 +27,7 @@ def experiment(
     from pathlib import Path
 
     from rich.console import Console
-    from rich.progress import track
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
     from deploy.experiment import ExperimentRequest, combine, find_experiment
@@ -37,13 +37,27 @@ def experiment(
     overrides = opt.overrides(sets)
     stderr = Console(stderr=True)
     results = []
-    for number in track(
-        range(seed, seed + seeds), f"experiment {name}", console=stderr, disable=not stderr.is_terminal, transient=True
-    ):
-        place = directory if seeds == 1 else directory / f"seed-{number}"
-        place.mkdir(parents=True, exist_ok=True)
-        results.append(run(ExperimentRequest(number, overrides, place, processes)))
-        opt.write_json(results[-1].as_json(), place / "metrics.json")
+    display = Progress(
+        TextColumn("[bold]experiment {task.fields[experiment]}"),
+        BarColumn(bar_width=30),
+        TaskProgressColumn(),
+        TextColumn("seed {task.fields[seed]}, {task.description}"),
+        TimeElapsedColumn(),
+        console=stderr,
+        disable=not stderr.is_terminal,
+        transient=True,
+    )
+    with display:
+        task = display.add_task("starting", total=float(seeds), experiment=name, seed=seed)
+        for index in range(seeds):
+
+            def tell(share: float, what: str, index: int = index) -> None:
+                display.update(task, completed=index + share, description=what, seed=seed + index)
+
+            place = directory if seeds == 1 else directory / f"seed-{seed + index}"
+            place.mkdir(parents=True, exist_ok=True)
+            results.append(run(ExperimentRequest(seed + index, overrides, place, processes, tell)))
+            opt.write_json(results[-1].as_json(), place / "metrics.json")
     if json_:
         opt.print_json(results[0].as_json() if seeds == 1 else combine(results))
     else:

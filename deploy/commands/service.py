@@ -37,7 +37,7 @@ def _command(name: str) -> Callable[..., None]:
         scenario: ScenarioOption,
         sets: opt.Set = None,
         seed: opt.Seed = None,
-        duration: Annotated[float | None, typer.Option(help="Length of the run [s].")] = None,
+        duration: Annotated[float | None, typer.Option(help="Length of the run in seconds.")] = None,
         clock: opt.Clock = None,
         bus: opt.Bus = None,
         base_port: opt.BasePort = None,

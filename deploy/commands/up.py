@@ -16,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 def up(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Packaged name or YAML file.")],
-    duration: Annotated[float | None, typer.Option(help="Length [s]; default: the scenario's.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Length in simulated seconds; default: the scenario's.")] = None,
     seed: opt.Seed = None,
     out: opt.Out = None,
     sets: opt.Set = None,
@@ -29,6 +29,7 @@ def up(
 ) -> None:
     """Launch plant, HAL, controller and recorder as processes, supervise them, summarise the log."""
     import time
+    from contextlib import nullcontext
 
     from rich.console import Console
 
@@ -44,7 +45,9 @@ def up(
     from deploy.report import write_report
     from deploy.summary import summary_table
 
-    result = write_report(prepared.log, directory, plots=not no_plots)
+    console = Console(stderr=True)
+    with console.status("summing up") if console.is_terminal else nullcontext():
+        result = write_report(prepared.log, directory, plots=not no_plots)
     if json_:
         opt.print_json({**result.as_json(), "interrupted": outcome.interrupted, "recorder_lost": outcome.recorder_lost})
     else:

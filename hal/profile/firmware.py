@@ -19,6 +19,8 @@ from schemas.robot import RobotDescription
 SMOOTHING = 0.05
 """Half width, as a fraction of d, of the band around zero torque over which `inverse_dead_zone` goes from −d to d."""
 
+_UNIT = fixed(-1.0), fixed(1.0)
+
 
 @dataclass(frozen=True, slots=True)
 class FirmwareGains:
@@ -71,9 +73,19 @@ def inverse_dead_zone(torque: Array, width: Array, smoothing: float = 0.0) -> Ar
             cannot chatter, exact for |τ| ≥ smoothing · d, and short by less than smoothing · d below.
     """
     if smoothing > 0.0:
-        band = np.maximum(smoothing * width, np.finfo(np.float64).tiny)
-        return torque + width * bounded(torque / band, -1.0, 1.0)
+        return inverse_with_band(torque, width, smoothing_band(width, smoothing))
     return torque + width * np.sign(torque)
+
+
+def smoothing_band(width: Array, smoothing: float) -> Array:
+    """Half width [N·m] of the band in which `inverse_dead_zone` is smoothed, never zero."""
+    band: Array = np.maximum(smoothing * width, np.finfo(np.float64).tiny)
+    return band
+
+
+def inverse_with_band(torque: Array, width: Array, band: Array) -> Array:
+    """`inverse_dead_zone` with its `smoothing_band` given, for every cycle."""
+    return torque + width * bounded(torque / band, *_UNIT)
 
 
 def position_torque(

@@ -31,6 +31,7 @@ FRAME: Final = np.dtype(
 )
 """`np.frombuffer(frames, FRAME)` views a buffer of frames: identifier with flags, data length, 8 data bytes."""
 
+_WORD = np.dtype("<u4")
 _STRUCT = struct.Struct("<IB3x8s")
 
 
@@ -61,6 +62,18 @@ def unpack(buffer: bytes) -> Iterator[tuple[int, bytes]]:
         if length > 8:
             raise ProfileError(f"frame {can_id:#x}: length {length}, a CAN frame holds at most 8 bytes")
         yield can_id, data[:length]
+
+
+def can_ids(buffer: bytes) -> list[int]:
+    """List the identifiers (with flags) of the frames in a buffer, in order.
+
+    Raises:
+        ProfileError: the buffer is not a whole number of frames.
+    """
+    if len(buffer) % FRAME_BYTES:
+        raise ProfileError(f"a buffer of {len(buffer)} bytes is not a whole number of {FRAME_BYTES}-byte frames")
+    ids: list[int] = np.frombuffer(buffer, _WORD)[:: FRAME_BYTES // 4].tolist()
+    return ids
 
 
 def view(buffer: bytes) -> npt.NDArray[np.void]:

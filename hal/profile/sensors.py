@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from typing import Final
 
 from hal.errors import ProfileError
@@ -48,9 +49,8 @@ def encode_force_torque(
         force_resolution: [N] a count.
         torque_resolution: [N·m] a count.
     """
-    counts = [_count(value, force_resolution) for value in force]
-    counts += [_count(value, torque_resolution) for value in torque]
-    data = _FORCE_TORQUE.pack(FORCE_TORQUE_START, *counts)
+    counts = _counts(force, force_resolution), _counts(torque, torque_resolution)
+    data = _FORCE_TORQUE.pack(FORCE_TORQUE_START, *counts[0], *counts[1])
     return data[:8], data[8:]
 
 
@@ -73,7 +73,7 @@ def decode_force_torque(
 
 def encode_gyro(angular_velocity: Vector3) -> bytes:
     """Encode the gyro frame, [rad/s] in the sensor's frame."""
-    return _TRIPLE.pack(*(_count(value, GYRO_RESOLUTION) for value in angular_velocity))
+    return _TRIPLE.pack(*_counts(angular_velocity, GYRO_RESOLUTION))
 
 
 def decode_gyro(data: bytes) -> Vector3:
@@ -87,7 +87,7 @@ def decode_gyro(data: bytes) -> Vector3:
 
 def encode_acceleration(acceleration: Vector3) -> bytes:
     """Encode the acceleration frame: specific force [m/s²] in the sensor's frame."""
-    return _TRIPLE.pack(*(_count(value, ACCELERATION_RESOLUTION) for value in acceleration))
+    return _TRIPLE.pack(*_counts(acceleration, ACCELERATION_RESOLUTION))
 
 
 def decode_acceleration(data: bytes) -> Vector3:
@@ -101,7 +101,7 @@ def decode_acceleration(data: bytes) -> Vector3:
 
 def encode_quaternion(orientation: Quaternion) -> bytes:
     """Encode the orientation frame, sensor to world, scalar first."""
-    return _QUADRUPLE.pack(*(_count(value, QUATERNION_RESOLUTION) for value in orientation))
+    return _QUADRUPLE.pack(*_counts(orientation, QUATERNION_RESOLUTION))
 
 
 def decode_quaternion(data: bytes) -> Quaternion:
@@ -126,5 +126,8 @@ def _triple(data: bytes, resolution: float, what: str) -> Vector3:
     return x * resolution, y * resolution, z * resolution
 
 
-def _count(value: float, resolution: float) -> int:
-    return max(-_INT16_MAX, min(_INT16_MAX, round(value / resolution)))
+def _counts(values: Sequence[float], resolution: float) -> list[int]:
+    counts = [round(value / resolution) for value in values]
+    if max(counts) > _INT16_MAX or min(counts) < -_INT16_MAX:
+        return [max(-_INT16_MAX, min(_INT16_MAX, count)) for count in counts]
+    return counts

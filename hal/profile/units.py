@@ -33,6 +33,12 @@ def bounded(values: Array, low: Array | float, high: Array | float) -> Array:
     return result
 
 
+# Arrays, because numpy takes a Python number at twice the cost.
+_INT32 = fixed(-INT32_MAX), fixed(INT32_MAX)
+_INT16 = fixed(-INT16_MAX), fixed(INT16_MAX)
+_UINT16 = fixed(0), fixed(UINT16_MAX)
+
+
 @dataclass(frozen=True, slots=True)
 class DriveUnits:
     """Scales of all joints, in the order of the description; `direction` is part of both signed scales.
@@ -72,7 +78,7 @@ class DriveUnits:
     def counts_from_position(self, position: Array) -> Counts:
         """Nearest counts of joint angles [rad], saturated to 32 bits."""
         counts = np.rint((position - self.zero_offset) / self.radian_per_count)
-        return bounded(counts, -INT32_MAX, INT32_MAX).astype(np.int32)
+        return bounded(counts, *_INT32).astype(np.int32)
 
     def torque_from_per_mille(self, per_mille: npt.NDArray[np.integer]) -> Array:
         """Torques at the joint [N·m] of 0x6071 or 0x6077."""
@@ -81,7 +87,7 @@ class DriveUnits:
     def per_mille_from_torque(self, torque: Array) -> PerMille:
         """Nearest ‰ of rated torque for torques at the joint [N·m], saturated to 16 bits."""
         per_mille = np.rint(torque / self.newton_metre_per_mille)
-        return bounded(per_mille, -INT16_MAX, INT16_MAX).astype(np.int16)
+        return bounded(per_mille, *_INT16).astype(np.int16)
 
     def limit_from_per_mille(self, per_mille: npt.NDArray[np.integer]) -> Array:
         """Torque limits at the joint [N·m], of 0x6072: magnitudes, free of direction."""
@@ -91,4 +97,4 @@ class DriveUnits:
     def per_mille_from_limit(self, torque_limit: Array) -> PerMilleLimit:
         """0x6072 of torque limits at the joint [N·m], rounded down to ‰ so that a limit is never exceeded."""
         per_mille = np.floor(torque_limit / np.abs(self.newton_metre_per_mille) * (1.0 + 1e-12))
-        return bounded(per_mille, 0, UINT16_MAX).astype(np.uint16)
+        return bounded(per_mille, *_UINT16).astype(np.uint16)

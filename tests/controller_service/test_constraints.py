@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -43,6 +45,16 @@ def test_bounds_never_cross(arm: Robot, limits: JointLimits, q: float, v: float)
         assert (upper < 0.0).all()
     if q < -2.5 and v == 0.0:
         assert (lower > 0.0).all()
+
+
+def test_a_joint_beyond_its_range_changes_no_other_joints_bounds(arm: Robot, limits: JointLimits) -> None:
+    now = at(arm, 0.7, 0.4)
+    inside = limits.acceleration_bounds(now)
+    for i, q in ((0, 2.6), (4, -2.6), (8, 3.5)):
+        position = now.position.copy()
+        position[i] = q
+        bounds = limits.acceleration_bounds(replace(now, position=position))
+        assert np.array_equal(np.delete(bounds, i, axis=1), np.delete(inside, i, axis=1))
 
 
 def test_a_joint_pushed_as_hard_as_allowed_stops_at_its_range_and_keeps_its_speed(

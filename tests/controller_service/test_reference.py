@@ -34,8 +34,9 @@ def test_hand_paths(shape: str, plane: str, laps: int) -> None:
     motion = hand_motion(start, rotation, path)
     for time in (0.2, 0.9, 1.4, 2.0, 2.7, 3.0 * laps - 0.4):
         after, now, before = motion.at(time + STEP), motion.at(time), motion.at(time - STEP)
-        assert np.allclose(now.velocity, (after.position - before.position) / (2 * STEP), atol=1e-6)
+        assert np.allclose(now.velocity[:3], (after.position - before.position) / (2 * STEP), atol=1e-6)
         assert np.allclose(now.acceleration, (after.velocity - before.velocity) / (2 * STEP), atol=1e-6)
+        assert not now.velocity[3:].any()
     for time in (0.0, 3.0 * laps, 3.0 * laps + 1.0):
         end = motion.at(time)
         assert np.allclose(end.position, start)

@@ -85,12 +85,13 @@ def test_an_osqp_that_runs_out_of_iterations_says_so_and_recovers() -> None:
     kkt_holds(free, solver.solve(*free))
 
 
-def test_free_problems_cost_one_check() -> None:
+def test_free_problems_cost_no_iteration_and_are_exact() -> None:
     rng, solver = np.random.default_rng(14), MAKERS[0]()
     for _ in range(20):
         data = problem(rng, 1.2)
         solution = solver.solve(*data)
-        assert solution.iterations <= 5
+        assert solution.iterations == 0
+        kkt_holds(data, solution)
         assert np.allclose(solution.x, np.linalg.solve(data[0], -data[1]))
         assert not solution.dual.any()
 
@@ -105,6 +106,20 @@ def test_contradicting_rows_are_not_solved_and_do_no_harm_to_the_next(make: Call
     assert not solution.solved
     data = problem(rng, 0.5)
     kkt_holds(data, solver.solve(*data))
+
+
+def test_a_minimiser_at_a_bound_passes_smoothly_from_free_to_active() -> None:
+    rng, solver = np.random.default_rng(20), MAKERS[0]()
+    P, q, A, lower, upper = problem(rng, 1.2)
+    minimiser = np.linalg.solve(P, -q)
+    edge = A @ minimiser
+    row = int(np.argmax(edge[:N]))
+    for margin in (1e-3, 1e-6, -1e-6, -1e-3):
+        upper[row] = edge[row] + margin
+        solution = solver.solve(P, q, A, lower, upper)
+        kkt_holds((P, q, A, lower, upper), solution)
+        assert (solution.iterations > 0) == (margin < 0.0)
+        assert np.abs(solution.x - minimiser).max() <= 1e-5 + 10.0 * max(-margin, 0.0)
 
 
 def test_infinite_bounds_are_no_bounds() -> None:

@@ -5,9 +5,19 @@ from pathlib import Path
 
 import pytest
 
+from deploy.golden import write_golden
 from schemas.load import Run, load_run
 
+GOLDEN = Path(__file__).parents[1] / "data" / "golden.mcap"
 ARM9 = Path(__file__).parents[2] / "deploy" / "robots" / "arm9"
+
+
+@pytest.fixture(scope="session")
+def fresh_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The golden run, made now: position mode, torque mode along a path, position mode; must not be changed."""
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    write_golden(path)
+    return path
 
 
 @pytest.fixture

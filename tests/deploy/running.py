@@ -83,6 +83,18 @@ class Running:
         os.kill(self.pid_of(service), signal.SIGKILL)
         self._signalled_s = time.monotonic()
 
+    def signal(self, service: str, number: signal.Signals) -> None:
+        os.kill(self.pid_of(service), number)
+        self._signalled_s = time.monotonic()
+
+    def cli(self, *arguments: str) -> str:
+        """Run another `cosim` command beside it; its output."""
+        line = [sys.executable, "-m", "deploy.cli", *arguments]
+        environment = {**os.environ, "COSIM_RUN_DIR": str(self._runtime)}
+        done = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=30, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
     def interrupt(self) -> None:
         self.process.send_signal(signal.SIGINT)
         self._signalled_s = time.monotonic()

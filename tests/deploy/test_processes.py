@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from deploy.runner import run_to_log
 from mcap.reader import make_reader
+
+from deploy.runner import run_to_log
 from schemas.load import load_run
 from schemas.log import LogReader
 from schemas.messages import Event, JointCommand, PlantTruth, RobotState

@@ -8,32 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from deploy.inprocess import InProcess
-from schemas.fingerprint import fingerprint
-from schemas.load import load_run
 from schemas.log import LogReader, LogWriter
 from schemas.messages import JointCommand
 from schemas.topics import decode
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = load_run("arm9-transition", {"duration_s": 0.04})
-    path = tmp_path_factory.mktemp("log") / "good.mcap"
-    with LogWriter(path, run, fingerprint(run)) as writer:
-        InProcess(run, writer.write).run()
-    return path
-
-
 def _pytest(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    # By its module, and not a second time by its entry point, which a checkout may not have.
-    line = [sys.executable, "-m", "pytest", "-p", "no:cosim", "-p", "deploy.pytest_plugin", "-p", "no:cacheprovider"]
-    line += ["-c", "/dev/null", "--rootdir", str(folder)]
-    return subprocess.run([*line, *options], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    line = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(folder), *options]
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
 
 
-def test_each_part_of_each_log_is_a_test(log: Path, tmp_path: Path) -> None:
-    reader = LogReader(log)
+def test_each_part_of_each_log_is_a_test(fresh_log: Path, tmp_path: Path) -> None:
+    reader = LogReader(fresh_log)
     bad = tmp_path / "bad.mcap"
     with LogWriter(bad, reader.run, reader.fingerprint) as writer:
         for record in reader.records():
@@ -43,17 +29,18 @@ def test_each_part_of_each_log_is_a_test(log: Path, tmp_path: Path) -> None:
                 assert command.position is not None
                 data = data.replace(str(command.position[2]).encode(), b"0.123")
             writer.write_bytes(record.topic, data, record.sequence, record.time_ns)
-    done = _pytest(tmp_path, "--cosim-log", str(log), "--cosim-log", str(bad), "-v")
+    done = _pytest(tmp_path, "--cosim-log", str(fresh_log), "--cosim-log", str(bad), "-v")
     assert done.returncode == 1, done.stdout + done.stderr
     assert "2 failed, 4 passed" in done.stdout  # the HAL sent what the command asked, so its replay differs too
     assert "controller: tick 7, command.position[2]: logged 0.123" in done.stdout
     assert "Traceback" not in done.stdout
 
 
-def test_one_part_only(log: Path, tmp_path: Path) -> None:
-    done = _pytest(tmp_path, "--cosim-log", str(log), "--cosim-part", "hal")
+def test_one_part_beside_the_projects_own_tests(fresh_log: Path, tmp_path: Path) -> None:
+    (tmp_path / "test_own.py").write_text("def test_own():\n    assert True\n")
+    done = _pytest(tmp_path, "--cosim-log", str(fresh_log), "--cosim-part", "hal")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "1 passed" in done.stdout
+    assert "2 passed" in done.stdout
 
 
 def test_missing_log_is_a_usage_error(tmp_path: Path) -> None:

@@ -10,32 +10,19 @@ import pytest
 
 from deploy.cli import main
 from deploy.errors import UsageError
-from deploy.inprocess import InProcess
 from deploy.replay import PARTS, ReplayError, replay_log
 from schemas.base import Model
-from schemas.fingerprint import fingerprint
-from schemas.load import load_run
 from schemas.log import LogReader, LogWriter
 from schemas.messages import BusFrames, JointCommand, RobotState
 from schemas.topics import decode, topics_of
 
-CYCLES = 120
-OVERRIDES = {
-    "duration_s": CYCLES / 500.0,
-    "controller.phases.reach.duration_s": 0.06,
-    "controller.phases.reach.posture": {},
-    "controller.phases.settle.duration_s": 0.06,
-}
+CYCLES = 150
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run in one process with the change from position to torque mode in it."""
-    run = load_run("arm9-transition", OVERRIDES)
-    path = tmp_path_factory.mktemp("log") / "run.mcap"
-    with LogWriter(path, run, fingerprint(run)) as writer:
-        InProcess(run, writer.write).run()
-    return path
+def log(fresh_log: Path) -> Path:
+    """A run with both changes of mode in it."""
+    return fresh_log
 
 
 Edit = Callable[[str, Model], Model | None]
@@ -182,6 +169,24 @@ def test_tolerances_still_find_what_is_wrong(log: Path, tmp_path: Path) -> None:
         assert (result.difference.tick, result.difference.field) == (70, "state.position_measured[1]")
 
 
+@pytest.mark.parametrize("part", PARTS)
+def test_a_cut_log_is_replayed_up_to_where_it_ends(log: Path, tmp_path: Path, part: str) -> None:
+    cut = tmp_path / "cut.mcap"
+    with LogWriter(cut, LogReader(log).run, LogReader(log).fingerprint) as writer:
+        for record in LogReader(log).records():
+            writer.write_bytes(record.topic, record.data, record.sequence, record.time_ns)
+            if record.topic == "state" and record.sequence in (40, 80):
+                writer.flush()
+    data = cut.read_bytes()
+    for end, least, most in ((len(data) - 40, CYCLES, CYCLES + 10), (len(data) * 3 // 4, 39, CYCLES - 1)):
+        cut.write_bytes(data[:end])
+        assert not LogReader(cut).complete
+        result = replay_log(cut, part)
+        assert result.exact
+        assert result.passed, result.describe()
+        assert least <= result.compared <= most
+
+
 def test_nothing_to_replay_is_an_error(log: Path, tmp_path: Path) -> None:
     empty = rewritten(log, tmp_path / "run.mcap", lambda _topic, _message: None)
     for part in PARTS:
@@ -194,8 +199,11 @@ def test_nothing_to_replay_is_an_error(log: Path, tmp_path: Path) -> None:
 def test_command_line_exits_0_and_1(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(log), "--all"]) == 0
     assert capsys.readouterr().out.count("come out the same") == len(PARTS)
+    commands = {command.sequence: command for command in LogReader(log).messages(JointCommand)}
+    before = commands[90].torque
+    assert before is not None
     edited = rewritten(
-        log, tmp_path / "run.mcap", at(90, JointCommand, lambda m: changed(m, torque=bumped(m.torque, 0, 1.0)))
+        log, tmp_path / "run.mcap", at(90, JointCommand, lambda m: changed(m, torque=bumped(before, 0, 1.0)))
     )
     assert main(["replay", str(edited)]) == 1
-    assert "tick 90, command.torque[0]" in capsys.readouterr().out
+    assert f"tick 90, command.torque[0]: logged {before[0] + 1.0}, replayed {before[0]}" in capsys.readouterr().out

@@ -3,21 +3,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-
-from deploy.golden import write_golden
 from deploy.report import write_report
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("log") / "run.mcap"
-    write_golden(path)
-    return path
-
-
-def test_a_report_holds_metrics_and_a_figure_of_each_change(log: Path, tmp_path: Path) -> None:
-    report = write_report(log, tmp_path / "plots")
+def test_a_report_holds_metrics_and_a_figure_of_each_change(fresh_log: Path, tmp_path: Path) -> None:
+    report = write_report(fresh_log, tmp_path / "plots")
     names = {path.name for path in report.files}
     assert names == {"metrics.json", "joints.svg", "hand.svg", "transition-1.svg", "transition-2.svg"}
     assert all(path.stat().st_size > 0 for path in report.files)
@@ -27,9 +17,9 @@ def test_a_report_holds_metrics_and_a_figure_of_each_change(log: Path, tmp_path:
     assert metrics["hand_error_rms_m"] is not None
 
 
-def test_a_cut_log_is_reported_as_cut(log: Path, tmp_path: Path) -> None:
+def test_a_cut_log_is_reported_as_cut(fresh_log: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(log.read_bytes()[:-40])
+    cut.write_bytes(fresh_log.read_bytes()[:-40])
     report = write_report(cut, tmp_path, plots=False)
     assert report.metrics.log_complete is False
     assert report.metrics.states > 0

@@ -54,6 +54,7 @@ def test_a_real_robot_has_no_plant(run: Run, runtime: Path, tmp_path: Path) -> N
 def test_ports_in_use_are_passed_over() -> None:
     first = session.free_base_port()
     with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of an earlier run may linger
         taken.bind(("127.0.0.1", first + 1))
         taken.listen()
         assert not first <= session.free_base_port() < first + session.PORTS

@@ -68,6 +68,25 @@ def test_modes_and_errors_are_kept_between_reports() -> None:
     assert measured.error_code.tolist() == [0x7305, 0]
 
 
+def test_what_did_not_change_is_the_array_of_the_cycle_before() -> None:
+    unit = decoder("torque", "torque")
+    before = unit.decode([report(1), report(2)])
+    after = unit.decode([report(1, 5), report(2, 6)])
+    assert after.drive_state is before.drive_state
+    assert after.mode is before.mode
+    assert after.error_code is before.error_code
+    assert after.position.tolist() != before.position.tolist()
+    fault = unit.decode([report(1, 5, statusword=0x0208), report(2, 6)])
+    assert fault.drive_state.tolist() == [DriveState.FAULT, DriveState.OPERATION_ENABLED]
+    assert after.drive_state.tolist() == [DriveState.OPERATION_ENABLED] * 2
+
+
+def test_an_undefined_statusword_is_told_in_every_cycle() -> None:
+    unit = decoder("torque")
+    for _ in range(2):
+        assert len(unit.decode([report(1, statusword=0x0001), b""]).notices) == 1
+
+
 def test_an_undefined_statusword_stops_and_keeps_the_state() -> None:
     measured = decoder("torque").decode([report(1, statusword=0x0001), b""])
     (notice,) = measured.notices
@@ -132,4 +151,5 @@ def test_broken_buffers_and_doubled_identifiers_are_refused() -> None:
         decoder("torque").decode([report(1)[:-1], b""])
     clash = wrist().model_copy(update={"bus": "a", "can_id": 0x181})
     with pytest.raises(HalError, match="wrist: identifier 0x181 is used twice"):
-        Decoder(robot("torque", force_torque_sensors=(clash,)), np.zeros(1))
+        # The description refuses it as well, when it is loaded.
+        Decoder(robot("torque").model_copy(update={"force_torque_sensors": (clash,)}), np.zeros(1))

@@ -198,3 +198,14 @@ def test_gains_reach_the_axis(bench):
     first, second = bench.axis.gains
     assert first.position_gain == pytest.approx(1500.0)
     assert second.hold_ramp_s == pytest.approx(0.25)
+
+
+def test_a_tick_is_never_late_for_what_became_due_after_the_tick_before(bench):
+    bench.enable(mode=10)
+    bench.sync()
+    bench.wait(1)
+    bench.write(0x1017, 0, 1, 2)  # a heartbeat, asked for between two ticks that had nothing to do
+    assert [can_id for can_id, _ in bench.wait(2)] == [0x705]
+    bench.write(0x1017, 0, 0, 2)
+    bench.device.fault(0x5400)
+    assert [can_id for can_id, _ in bench.wait(1)] == [0x085]

@@ -21,3 +21,11 @@ def test_load_of_a_cycle(run: Any) -> None:
     assert sensors.bits == 55 + 2 * 135
     assert sensors.commands == ()
     assert drives.report_time_s + drives.command_time_s == pytest.approx(drives.bits * 1e-6)
+
+
+@pytest.mark.parametrize("kind", ["position_pd", "servo"])
+def test_drives_of_one_mode_report_it_on_an_error_alone(files: Any, kind: str) -> None:
+    for joint in files.robot["joints"]:
+        joint["drive"]["kind"] = kind
+    reports = bus_loads(files.load().robot.description)[0].reports
+    assert [name for name, _ in reports] == ["TPDO1", "TPDO1", "TPDO2"]

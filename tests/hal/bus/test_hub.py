@@ -327,7 +327,10 @@ class TestProcesses:
     def test_can_logger_writes_what_was_sent(self, path: str, tmp_path: Path) -> None:
         log = tmp_path / "bus.csv"
         with BusHub(path) as hub:
-            logger = self.run("-m", "can.logger", "-i", "cosim", "-c", path, "-f", str(log))
+            # As `python -m can.logger`, with the Ctrl-C that a program started in the background lacks.
+            heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+            module = "import runpy; runpy.run_module('can.logger', run_name='__main__')"
+            logger = self.run("-c", f"{heed}; {module}", "-i", "cosim", "-c", path, "-f", str(log))
             deadline = time.monotonic() + 30.0
             while hub.clients == 0 and time.monotonic() < deadline:
                 hub.receive(0.05)
