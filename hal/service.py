@@ -87,7 +87,9 @@ class HalService:
             core.leave()
         self._hold(self._robot.command_delay_cycles + 1 if finished else self._ramp_cycles)
         if not finished and life.signalled is None:
-            raise SafeStopError(f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}") from core.cause
+            raise SafeStopError(
+                f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}"
+            ) from core.cause
 
     @property
     def _ramp_cycles(self) -> int:

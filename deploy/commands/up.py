@@ -16,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 def up(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Packaged name or YAML file.")],
-    duration: Annotated[float | None, typer.Option(help="Length in simulated seconds; default: the scenario's.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Length [s simulated]; default: the scenario's.")] = None,
     seed: opt.Seed = None,
     out: opt.Out = None,
     sets: opt.Set = None,
