@@ -8,7 +8,7 @@ import numpy as np
 
 from controller_service.model import Configuration
 from controller_service.reference import HandMotion, PostureMotion, hand_motion
-from controller_service.tasks import PoseTarget, PoseTask, PostureTarget, PostureTask, Task
+from controller_service.tasks import FRAME_TASKS, PoseTarget, PostureTarget, PostureTask, Task
 from schemas.base import ControlMode
 from schemas.controller import ControllerConfig, Phase
 from schemas.errors import ConfigurationError
@@ -108,7 +108,8 @@ class References:
         if self._hand is None or self._frame is None:
             return (posture,)
         self.hand_target = self._hand.at(elapsed)
-        return posture, PoseTask(now, self._frame, self.hand_target, self._config.hand)
+        task = FRAME_TASKS[self._config.hand_task]
+        return posture, task(now, self._frame, self.hand_target, self._config.hand)
 
     def _enter(self, time: PhaseTime, now: Configuration) -> None:
         phase = time.phase

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Final, Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -86,6 +86,8 @@ class PostureTask:
 class PoseTask:
     """Position (7) and orientation (8) of a frame; A = J, b = [v̇^ob; ω̇^ob] − J̇ q̇ (9), (6, n) and (6,)."""
 
+    rows: ClassVar[slice] = slice(0, 6)
+    """Of the frame's motion that the task asks for: linear, then angular."""
     configuration: Configuration
     frame: str
     target: PoseTarget
@@ -97,7 +99,7 @@ class PoseTask:
         return self.gains.weight
 
     def linear(self) -> tuple[Array, Array]:
-        """Return A (6, n), b (6,)."""
+        """Return A (k, n), b (k,), k the number of `rows`."""
         now, target, gains = self.configuration.frames[self.frame], self.target, self.gains
         error = np.empty(6)
         error[:3] = target.position - now.position
@@ -106,7 +108,7 @@ class PoseTask:
         objective += gains.damping * (target.velocity - now.velocity)
         objective += target.acceleration
         objective -= now.drift
-        return now.jacobian, objective
+        return now.jacobian[self.rows], objective[self.rows]
 
     def add_to(self, P: Array, q: Array) -> None:
         """Add w JᵀJ to P and −w Jᵀb to q, in place."""
@@ -114,6 +116,24 @@ class PoseTask:
         weighted = self.gains.weight * A.T
         P += weighted.dot(A)
         q -= weighted.dot(b)
+
+
+class PositionTask(PoseTask):
+    """Position (7) of a frame alone: its orientation is free."""
+
+    __slots__ = ()
+    rows = slice(0, 3)
+
+
+class OrientationTask(PoseTask):
+    """Orientation (8) of a frame alone: its position is free."""
+
+    __slots__ = ()
+    rows = slice(3, 6)
+
+
+FRAME_TASKS: Final = {"pose": PoseTask, "position": PositionTask, "orientation": OrientationTask}
+"""By the names of `ControllerConfig.hand_task`."""
 
 
 def orientation_error(desired: Array, current: Array) -> Array:

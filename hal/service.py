@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import signal
 import time
+from contextlib import suppress
 from typing import Final
 
+from hal.bus.errors import BusLostError
 from hal.bus.ports import open_port
 from hal.errors import HalError
 from hal.master import Master
@@ -29,6 +31,8 @@ COMMAND_MARGIN: Final = 0.2
 """Share of the period before the next SYNC that is kept for the RPDOs (realtime)."""
 SIGNALLED: Final = 128
 """Exit code, plus the signal's number, of a run that a signal cut short: the shells' convention."""
+BLAME_S: Final = 0.2
+"""Wait after the loss of a bus for the loss of the service that hosted it."""
 SETTLE_S: Final = 0.1
 """Simulated time that the HAL stays beyond the hold's ramp when it stops a robot."""
 
@@ -80,7 +84,11 @@ class HalService:
                     break
         except PeerLostError as loss:
             core.stop(str(loss))
-            self._hold(self._ramp_cycles)
+            with suppress(BusLostError):  # a plant that hosts the bus takes it along, and `loss` tells of it
+                self._hold(self._ramp_cycles)
+            raise
+        except BusLostError:
+            self._blame_peers()
             raise
         finished = core.status is HalStatus.ACTIVE
         if finished:
@@ -90,6 +98,18 @@ class HalService:
             raise SafeStopError(
                 f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}"
             ) from core.cause
+
+    def _blame_peers(self) -> None:
+        """Give a peer's loss the time to be noticed: whoever hosts a virtual bus takes it along.
+
+        Raises:
+            PeerLostError: naming the peer.
+
+        """
+        deadline = time.monotonic() + BLAME_S
+        while time.monotonic() < deadline:
+            self._life.check_peers()
+            time.sleep(LOOK_UP_S)
 
     @property
     def _ramp_cycles(self) -> int:

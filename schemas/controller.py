@@ -68,6 +68,8 @@ class ControllerConfig(Model):
     velocity_cutoff_hz: PositiveFloat = 60.0
     """First-order low-pass on the differentiated positions."""
     posture: TaskGains = TaskGains(stiffness=25.0, damping=10.0, weight=1.0)
+    hand_task: Literal["pose", "position", "orientation"] = "pose"
+    """What of the hand a path or a hold controls; the rest follows the posture."""
     hand: TaskGains = TaskGains(stiffness=900.0, damping=60.0, weight=1000.0)
     qp: QpConfig = QpConfig()
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)]

@@ -8,7 +8,14 @@ import pytest
 
 from controller_service.model import Array, Configuration, RobotModel
 from controller_service.qp import objective
-from controller_service.tasks import PoseTarget, PoseTask, PostureTarget, PostureTask, orientation_error
+from controller_service.tasks import (
+    FRAME_TASKS,
+    PoseTarget,
+    PoseTask,
+    PostureTarget,
+    PostureTask,
+    orientation_error,
+)
 from schemas.controller import TaskGains
 from schemas.load import Robot
 
@@ -38,6 +45,18 @@ def test_pose_task_asks_for_the_pd_acceleration(now: Configuration) -> None:
     reached = frame.jacobian @ acceleration + frame.drift
     error = np.concatenate((target.position - frame.position, turn))
     assert np.allclose(reached, 100 * error + 20 * (target.velocity - frame.velocity) + target.acceleration)
+
+
+def test_position_and_orientation_are_the_two_halves_of_a_pose(now: Configuration) -> None:
+    vectors = np.random.default_rng(8).normal(size=(5, 3))
+    target = PoseTarget(vectors[0], np.eye(3), vectors[1:3].ravel(), vectors[3:5].ravel())
+    halves = [FRAME_TASKS[name](now, "hand", target, GAINS).linear() for name in ("position", "orientation")]
+    A, b = FRAME_TASKS["pose"](now, "hand", target, GAINS).linear()
+    assert [half[0].shape for half in halves] == [(3, 9), (3, 9)]
+    assert np.array_equal(np.vstack([half[0] for half in halves]), A)
+    assert np.array_equal(np.concatenate([half[1] for half in halves]), b)
+    alone = np.linalg.lstsq(*halves[0], rcond=None)[0]
+    assert not np.allclose(A[3:] @ alone, b[3:]), "the orientation stays free"
 
 
 def test_objective_is_the_weighted_sum_of_squares(now: Configuration) -> None:

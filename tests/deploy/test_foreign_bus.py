@@ -119,7 +119,10 @@ def test_a_can_logger_hears_a_running_robot(tmp_path: Path) -> None:
     with cosim_up(tmp_path, "arm9-transition", "--duration", "60") as running:
         running.wait_for_sequence(50)
         session = running.session()
-        line = ["-m", "can.logger", "-i", "cosim", "-c", f"{session.directory}/arm9-1", "-f", str(trace)]
+        # As `python -m can.logger`, with the Ctrl-C that a program started in the background lacks.
+        heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+        module = "import runpy; runpy.run_module('can.logger', run_name='__main__')"
+        line = ["-c", f"{heed}; {module}", "-i", "cosim", "-c", f"{session.directory}/arm9-1", "-f", str(trace)]
         logger = subprocess.Popen([sys.executable, *line], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             assert wait_for(lambda: trace.exists() and trace.stat().st_size > 4000)

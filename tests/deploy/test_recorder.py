@@ -56,6 +56,13 @@ def _ends(process: subprocess.Popen[str], code: int) -> str:
     return errors
 
 
+def _await_writing(log: Path) -> None:
+    size, deadline = log.stat().st_size, time.monotonic() + 20.0
+    while log.stat().st_size == size:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 def test_records_all_until_the_last_word(run: Run, tmp_path: Path) -> None:
     with recorder(run, tmp_path) as (process, hal):
         for k in range(COUNT):
@@ -74,6 +81,7 @@ def test_records_all_until_the_last_word(run: Run, tmp_path: Path) -> None:
 def test_ends_with_a_lost_peer(run: Run, tmp_path: Path) -> None:
     with recorder(run, tmp_path) as (process, hal):
         hal.publish(hal.keys.event, _event(1))
+        _await_writing(tmp_path / "run.mcap")  # one that is gone before all are ready never began
         hal.close()
         assert _ends(process, 0) == ""
     assert [event.sequence for event in LogReader(tmp_path / "run.mcap").messages(Event)] == [1]
