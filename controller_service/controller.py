@@ -65,8 +65,9 @@ class Controller:
     again from the firmware's target. A change from position to torque takes two ticks (section IV-A of [Benallegue
     2021]): CAPTURE, then the first torque, with the integral term set so that uʳ + L s₀ is the torque that the position
     loop was giving; the tasks start from the measured configuration. From torque to position the first target is the
-    measured position, and the reference goes on from there with the estimated velocity; the HAL adds what its firmware
-    needs to hold (docs/architecture.md).
+    measured position, and the reference starts there at rest: the holding rule has the firmware brake what still moves,
+    where a reference that moved on would add k_d q̇ to the torque one period later. The HAL adds what its firmware needs
+    to hold (docs/architecture.md).
 
     Args:
         run: robot and scenario.
@@ -179,7 +180,7 @@ class Controller:
             if before is Stage.HOLD:
                 self._position = _firmware_target(state)
             elif before is Stage.TORQUE:
-                self._position, self._velocity = estimate.position, estimate.velocity
+                self._position, self._velocity = estimate.position, np.zeros(self._n)
                 self._torques.clear()
         now = self._model.configure(self._position, self._velocity)
         tasks = self._references.tasks(time, now)

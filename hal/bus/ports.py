@@ -75,13 +75,14 @@ class CosimPort:
             packet = self._packet()
             if packet is None:
                 return b""
-        following = self._packet()
-        if following is None:
-            return packet
-        packets = [packet]
-        while following is not None:
-            packets.append(following)
-            following = self._packet()
+        packets = []
+        try:
+            while packet is not None:
+                packets.append(packet)
+                packet = self._packet()
+        except BusLostError:
+            # What was read before the end is still good; the next call finds the bus gone again and says so.
+            pass
         return b"".join(packets)
 
     def fileno(self) -> int:

@@ -112,3 +112,16 @@ def test_group_notices_a_lost_bus(tmp_path: Path) -> None:
         group.receive(2.0)
     hubs[0].close()
     group.close()
+
+
+def test_what_came_before_the_end_of_a_bus_is_still_received(tmp_path: Path) -> None:
+    hub = BusHub(tmp_path / "bus")
+    port = CosimPort("bus", tmp_path / "bus")
+    hub.poll()
+    hub.send(SYNC)
+    hub.send(pack(0x181, b"\1"))
+    hub.close()
+    assert port.receive(0.5) == SYNC + pack(0x181, b"\1")
+    with pytest.raises(BusLostError):
+        port.receive(0.5)
+    port.close()
