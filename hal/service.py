@@ -85,6 +85,8 @@ class HalService:
         except PeerLostError as loss:
             core.stop(str(loss))
             with suppress(BusLostError):  # a plant that hosts the bus takes it along, and `loss` tells of it
+                self._master.apply(None)
+                self._sequence += 1
                 self._hold(self._ramp_cycles)
             raise
         except BusLostError:
@@ -95,9 +97,8 @@ class HalService:
             core.leave()
         self._hold(self._robot.command_delay_cycles + 1 if finished else self._ramp_cycles)
         if not finished and life.signalled is None:
-            raise SafeStopError(
-                f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}"
-            ) from core.cause
+            reason = f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}"
+            raise SafeStopError(reason) from core.cause
 
     def _blame_peers(self) -> None:
         """Give a peer's loss the time to be noticed: whoever hosts a virtual bus takes it along.

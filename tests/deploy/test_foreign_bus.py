@@ -71,9 +71,6 @@ def operated(channel: Path, target: int, cycle_s: float) -> Iterator[BaseNode402
         for index in (0x6040, 0x6060, target):
             node.rpdo[1].add_variable(index)
         node.rpdo[1].save()
-        node.tpdo[2].read()
-        node.tpdo[2].trans_type = 1  # p402 waits for every mode report
-        node.tpdo[2].save()
         node.setup_402_state_machine()
         node.nmt.state = "OPERATIONAL"
         network.sync.start(cycle_s)
