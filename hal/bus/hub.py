@@ -101,15 +101,11 @@ class BusHub:
         """As `receive`, without waiting."""
         if self._closed:
             raise BusLostError(f"bus {self.name}: the hub is closed")
-        ready = self._epoll.poll(0)
-        if len(ready) == 1 and ready[0][0] != self._listener_fd:
-            return self._read(ready[0][0])
         received = []
-        # Whoever connected before a frame was sent must get it: accept first.
-        if any(descriptor == self._listener_fd for descriptor, _ in ready):
-            self._accept()
-        for descriptor, _ in ready:
-            if descriptor != self._listener_fd and descriptor in self._clients:
+        for descriptor, _ in self._epoll.poll(0):
+            if descriptor == self._listener_fd:
+                self._accept()
+            elif descriptor in self._clients:
                 received.append(self._read(descriptor))
         return b"".join(received)
 
@@ -162,8 +158,11 @@ class BusHub:
             elif len(packet) % FRAME_BYTES or len(packet) > MAX_PACKET:
                 self.malformed_packets += 1
             else:
-                self._deliver(packet, client)
                 received.append(packet)
+        # Whoever had connected before these were sent may still wait to be accepted, and is owed them.
+        self._accept()
+        for packet in received:
+            self._deliver(packet, client)
         return received[0] if len(received) == 1 else b"".join(received)
 
     def _deliver(self, packet: bytes, sender: _Client | None) -> None:
