@@ -14,8 +14,9 @@ from schemas.load import Run
 from schemas.log import LogWriter, UnknownTopicError
 from schemas.messages import Event
 from schemas.service import Service, ServiceOptions
+from schemas.subscription import Sample
 from schemas.topics import MalformedMessageError, decode
-from schemas.transport import Sample, open_service
+from schemas.transport import open_service
 
 DRAIN_S: Final = 0.2
 """Silence after which nothing more is expected, once all services have stopped or the recorder is told to."""

@@ -14,25 +14,23 @@ from __future__ import annotations
 
 import json
 import os
-import queue
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Final, Self
 
 import zenoh
 from pydantic import Field, PositiveInt
-from zenoh.handlers import Callback, FifoChannel, Handler
+from zenoh.handlers import Callback, FifoChannel
 
 from schemas.base import Clock, Model
 from schemas.errors import CosimError
 from schemas.keys import Keys
 from schemas.load import Run
 from schemas.service import Service, ServiceOptions
+from schemas.subscription import STAMP, Backlog, Subscription
 from schemas.topics import encode, stamp
 
 SERVICES: Final = tuple(service.value for service in Service)
@@ -53,7 +51,6 @@ WAIT_SLICE_S: Final = 0.1
 LAST_WORDS_S: Final = 0.05
 """Realtime: time for the last messages to leave before the liveliness token, which Zenoh sends ahead of all others."""
 
-_STAMP: Final = struct.Struct("<qq")
 _RUNTIME: Final = "(rx: (handover: app), tx: (handover: app), acc: (handover: app), app: (worker_threads: 1))"
 """One network thread a process instead of one a task: a fifth off the round trip on two cores."""
 
@@ -83,79 +80,6 @@ class TransportConfig(Model):
     """Period of connection attempts to services that are not there yet."""
     zenoh_file: str | None = None
     """A Zenoh configuration (JSON5) that replaces all of the above, e.g. `deploy/zenoh/lan.json5`."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """A message as it arrived."""
-
-    topic: str
-    """Leaf of the key: `state`, `bus/can0`, …"""
-    data: bytes
-    sequence: int
-    time_ns: int
-
-
-class Subscription:
-    """Messages of one key expression, oldest first; with `newest`, only the last that arrived."""
-
-    def __init__(self, *, newest: bool) -> None:
-        self._newest = newest
-        self._queue: queue.SimpleQueue[zenoh.Sample | None] = queue.SimpleQueue()
-        self._slot: zenoh.Sample | None = None
-        self._fresh = threading.Lock()
-        self._fresh.acquire()
-        self.root_length = 0
-        """Length of the key in front of the topic."""
-
-    def receive(self, timeout_s: float) -> bytes | None:
-        """Next message's bytes; None after the timeout, and at once when a peer is lost meanwhile."""
-        sample = self._take(timeout_s)
-        return None if sample is None else sample.payload.to_bytes()
-
-    def receive_sample(self, timeout_s: float) -> Sample | None:
-        """As `receive`, with topic, sequence and time, which are read without parsing the message."""
-        sample = self._take(timeout_s)
-        if sample is None:
-            return None
-        return _unwrap(sample, self.root_length)
-
-    def deliver(self, sample: zenoh.Sample | None) -> None:
-        """Take in a sample (network thread); None only wakes the reader."""
-        if not self._newest:
-            self._queue.put(sample)
-            return
-        if sample is not None:
-            self._slot = sample
-        try:
-            self._fresh.release()
-        except RuntimeError:
-            return  # already released: the reader has not yet come, and will find the newer sample
-
-    def _take(self, timeout_s: float) -> zenoh.Sample | None:
-        if not self._newest:
-            try:
-                return self._queue.get(timeout=timeout_s)
-            except queue.Empty:
-                return None
-        self._fresh.acquire(timeout=timeout_s)
-        sample, self._slot = self._slot, None
-        return sample
-
-
-class Backlog:
-    """Messages of one key expression kept outside Python until they are taken, for a reader that is in no hurry."""
-
-    def __init__(self, subscriber: zenoh.Subscriber[Handler[zenoh.Sample]], root_length: int) -> None:
-        self._subscriber = subscriber
-        self._root_length = root_length
-
-    def take(self) -> list[Sample]:
-        """All that has arrived since the last call, oldest first; never waits."""
-        samples = []
-        while (sample := self._subscriber.try_recv()) is not None:
-            samples.append(_unwrap(sample, self._root_length))
-        return samples
 
 
 class Transport:
@@ -205,7 +129,7 @@ class Transport:
         if publisher is None:
             publisher = self.declare_publisher(key)
         try:
-            publisher.put(data, attachment=_STAMP.pack(sequence, time_ns))
+            publisher.put(data, attachment=STAMP.pack(sequence, time_ns))
         except zenoh.ZError as error:
             raise TransportError(f"{self.service} cannot publish on {key}: {error}") from error
 
@@ -329,12 +253,6 @@ class Transport:
         if self._lost:
             for subscription in self._subscriptions:
                 subscription.deliver(None)
-
-
-def _unwrap(sample: zenoh.Sample, root_length: int) -> Sample:
-    attachment = sample.attachment
-    sequence, time_ns = _STAMP.unpack(attachment.to_bytes()) if attachment is not None else (0, 0)
-    return Sample(str(sample.key_expr)[root_length:], sample.payload.to_bytes(), sequence, time_ns)
 
 
 def open_service(service: str, run: Run, options: ServiceOptions) -> Transport:
