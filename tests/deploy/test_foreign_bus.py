@@ -78,6 +78,7 @@ def operated(channel: Path, target: int, cycle_s: float) -> Iterator[BaseNode402
         node.rpdo[1].start(cycle_s)
         yield node
     finally:
+        node.state = "SWITCH ON DISABLED"  # the next master must not take this one's drive for its own
         node.rpdo[1].stop()
         network.sync.stop()
         node.nmt.state = "PRE-OPERATIONAL"
