@@ -17,6 +17,10 @@ class ChildDiedError(DeployError):
     """A service ended before the run did; the message names it and what it printed last."""
 
 
+class RunStoppedError(DeployError):
+    """The HAL stopped the robot before the run was over; the message says why."""
+
+
 class ReportError(DeployError):
     """A log holds too little for what was asked of it."""
 

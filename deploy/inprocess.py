@@ -73,8 +73,9 @@ class InProcess:
 
     def finish(self) -> None:
         """Leave the robot holding."""
+        cycles = self.master.core.cycles_to_hold
         self.master.core.leave()
-        for _ in range(self._run.robot.description.command_delay_cycles + 1):
+        for _ in range(cycles):
             self._exchange()
             self._advance()
             self.master.apply(None)

@@ -84,8 +84,11 @@ def plan(run: Run, directory: Path, *, base_port: int | None = None, with_plant:
 
     Raises:
         LaunchError: no free ports, or no place for sockets.
+        UsageError: another run has this base port.
 
     """
+    if base_port is not None:
+        sessions.refuse_taken(base_port)
     services = tuple(service for service in Service if with_plant or service is not Service.PLANT)
     port = base_port if base_port is not None else sessions.free_base_port()
     options = ServiceOptions(
@@ -106,7 +109,11 @@ def launch(plan: Plan, progress: RunProgress, make_monitor: MonitorMaker) -> Out
 
     """
     run_file = plan.directory.absolute() / RUN_NAME
-    write_run(plan.run, run_file)
+    try:
+        write_run(plan.run, run_file)
+    except OSError as error:
+        sessions.discard(plan.options.run_directory)
+        raise UsageError(f"--out {plan.directory}: cannot be written: {error.strerror}") from error
     environment = service_environment(plan.options.run_directory)
     started = time.monotonic()
     try:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deploy.compare import HAL, PLANT, Difference, Tolerances, compare
+from deploy.replay import ReplayError
 from hal.cycle import HalCore
 from hal.profile.frames import FRAME_BYTES, unpack
 from hal.profile.identifiers import SYNC
@@ -46,7 +47,7 @@ def replay_hal(reader: LogReader, exact: bool) -> tuple[int, Difference | None]:
     tolerances: Tolerances | None = None if exact else HAL
     buses = [bus.name for bus in reader.run.robot.description.buses]
     compared = 0
-    for sequence, cycle in _in_order(cycles, buses, gaps=_has_gaps(reader)):
+    for sequence, cycle in _in_order(cycles, buses, gaps=_has_gaps(reader), complete=reader.complete):
         assert cycle.state is not None
         state = core.decode(sequence, [cycle.received[bus] for bus in buses])
         if (difference := compare(sequence, "state", cycle.state, state, tolerances)) is not None:
@@ -83,7 +84,8 @@ def replay_plant(reader: LogReader, exact: bool) -> tuple[int, Difference | None
     used = _used_commands(reader, cycles)
     core = None if exact else _fresh_core(reader, cycles)
     compared, last_sequence = 0, -1
-    for sequence, cycle in _in_order(cycles, buses, gaps=_has_gaps(reader), need_state=not exact):
+    ordered = _in_order(cycles, buses, gaps=_has_gaps(reader), complete=reader.complete, need_state=not exact)
+    for sequence, cycle in ordered:
         for _ in range(last_sequence + 1, sequence):
             plant.advance()
         last_sequence = sequence
@@ -133,13 +135,20 @@ def _has_gaps(reader: LogReader) -> bool:
 
 
 def _in_order(
-    cycles: dict[int, _Cycle], buses: list[str], *, gaps: bool, need_state: bool = True
+    cycles: dict[int, _Cycle], buses: list[str], *, gaps: bool, complete: bool, need_state: bool = True
 ) -> Iterator[tuple[int, _Cycle]]:
-    """Cycles from 0 on, up to the first that the log does not hold whole; with `gaps` those are passed over."""
+    """Cycles from 0 on, up to the first that the log does not hold whole; with `gaps` those are passed over.
+
+    Raises:
+        ReplayError: a `complete` log goes on after such a cycle: something was taken out of it.
+
+    """
     for expected, sequence in enumerate(sorted(key for key in cycles if key >= 0)):
         cycle = cycles[sequence]
         whole = len(cycle.sent) == len(buses) and (cycle.state is not None or not need_state)
         if not gaps and (not whole or sequence != expected):
+            if complete and any(c.state and len(c.sent) == len(buses) for key, c in cycles.items() if key > expected):
+                raise ReplayError(f"the log lacks state or frames of tick {expected}, yet goes on after it")
             return
         if whole:
             yield sequence, cycle

@@ -8,15 +8,16 @@ from typing import Final
 
 from rich.console import Console
 
-from deploy.errors import UsageError
+from deploy.errors import RunStoppedError, UsageError
 from deploy.inprocess import InProcess
 from deploy.launcher import LOG_NAME, launch, plan
 from deploy.monitor import RunMonitor
 from deploy.progress import RunProgress
-from schemas.base import Clock
+from schemas.base import Clock, Model
 from schemas.fingerprint import fingerprint
 from schemas.load import Run
 from schemas.log import LogWriter
+from schemas.messages import Event
 
 QUIET: Final = Console(file=StringIO())
 
@@ -26,6 +27,7 @@ def run_to_log(run: Run, directory: Path, *, processes: bool = False) -> Path:
 
     Raises:
         UsageError: the realtime clock in one process.
+        RunStoppedError: the HAL stopped the robot (one process; its log is there).
         CosimError: the run failed.
 
     """
@@ -39,5 +41,14 @@ def run_to_log(run: Run, directory: Path, *, processes: bool = False) -> Path:
     if run.scenario.clock is not Clock.LOCKSTEP:
         raise UsageError("a run in one process has the lockstep clock; use separate processes for realtime")
     with LogWriter(path, run, fingerprint(run)) as log:
-        InProcess(run, log.write).run()
+        stops: list[str] = []
+
+        def write(topic: str, message: Model) -> None:
+            log.write(topic, message)
+            if isinstance(message, Event) and message.kind == "safe_stop":
+                stops.append(f"stopped at sequence {message.sequence}: {message.text}")
+
+        InProcess(run, write).run()
+    if stops:
+        raise RunStoppedError(f"{path}: {stops[0]}")
     return path

@@ -106,18 +106,35 @@ def describe(run: Run, options: ServiceOptions, output: Path) -> RunningSession:
     )
 
 
+def refuse_taken(base_port: int) -> None:
+    """Refuse the base port of a run that is going on: its directory, sockets and note are that run's.
+
+    Raises:
+        UsageError: naming that run.
+
+    """
+    for session in running_sessions():
+        if session.base_port == base_port and session.pid != os.getpid():
+            raise UsageError(
+                f"--base-port {base_port}: taken by {session.scenario} (process {session.pid}); give another"
+            )
+
+
 def announce(session: RunningSession) -> None:
-    """Leave the note."""
-    path = Path(session.directory) / NOTE
+    """Leave the note, one a base port."""
+    path = run_directory(session.base_port) / NOTE
     path.write_text(json.dumps(asdict(session)), encoding="utf-8")
+
+
+def withdraw(session: RunningSession) -> None:
+    """Remove the note."""
+    (run_directory(session.base_port) / NOTE).unlink(missing_ok=True)
 
 
 def running_sessions() -> list[RunningSession]:
     """List the notes whose launcher still lives."""
-    root = runtime_root()
-    notes = [*sorted(root.glob(NOTE)), *sorted(root.glob(f"*/{NOTE}"))]
     found = []
-    for note in notes:
+    for note in sorted(runtime_root().glob(f"*/{NOTE}")):
         try:
             session = RunningSession(**json.loads(note.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from deploy.errors import UsageError
 from deploy.experiment import Bar, ExperimentRequest, ExperimentResult
 from deploy.metrics import CSP, CST, mode_changes
 from deploy.plots import transition_figure
@@ -52,6 +53,8 @@ ANY_ROBOT: Final[dict[str, Any]] = {
 }
 """What the scenario says of its own robot's joints, left out."""
 
+OWN_FIELDS: Final = ("seed", "duration_s", "controller.phases", "plant.initial_posture")
+
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
 
@@ -64,8 +67,17 @@ class Switches:
 
 
 def run(request: ExperimentRequest) -> ExperimentResult:
-    """Run the experiment for one seed: all poses, properly and naively."""
-    scenario = load_run(SCENARIO, {**ANY_ROBOT, **request.overrides})
+    """Run the experiment for one seed: all poses, properly and naively.
+
+    Raises:
+        UsageError: an override of what the experiment sets itself.
+        RunStoppedError: the HAL stopped a run.
+
+    """
+    for path in request.overrides:
+        if path.startswith(OWN_FIELDS):
+            raise UsageError(f"--set {path}: the experiment sets it itself; --seed chooses the seed")
+    scenario = load_run(SCENARIO, {**ANY_ROBOT, **request.overrides, "seed": request.seed})
     robot = scenario.robot
     poses = _poses(robot)
     proper: dict[str, Switches] = {}

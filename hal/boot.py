@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,7 +101,11 @@ def boot_network(robot: RobotDescription, ports: Sequence[FramePort], timeout_s:
         _prepare(link, joint, stand)
     for link in links:
         link.command(identifiers.NMT_START)
-    modes = [_enable(link, timeout_s) for link in links]
+    try:
+        modes = [_enable(link, timeout_s) for link in links]
+    except BootError:
+        _disable(links)
+        raise
     for sensor in robot.force_torque_sensors:
         ports[robot.bus_index(sensor.bus)].send(pack(sensor.command_id, force_torque_command(start=True)))
     return BootReport(
@@ -175,6 +180,13 @@ def _prepare(link: NodeLink, joint: Joint, counts: int) -> None:
         link.write(objects.TARGET_POSITION, 0, counts)
         if joint.drive.kind == "torque":
             link.write(objects.TARGET_TORQUE, 0, 0)
+
+
+def _disable(links: Iterable[NodeLink]) -> None:
+    """Take the power from all drives after a boot that failed: nobody will watch them, and their brakes hold."""
+    for link in links:
+        with suppress(BootError):  # the failure that led here is the one to tell of
+            link.write(objects.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
 
 
 def _enable(link: NodeLink, timeout_s: float) -> OperationMode:

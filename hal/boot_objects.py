@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from hal.profile import identifiers, objects
+from hal.profile.cia402 import AbortConnectionOption
 from schemas.robot import Drive, Joint, RobotDescription
 
 PROFILE_VENDOR_ID = 0x00000402
@@ -44,18 +45,26 @@ def communication_writes(description: RobotDescription, drive: Drive) -> tuple[S
 
 
 def drive_writes(description: RobotDescription, joint: Joint) -> tuple[SdoWrite, ...]:
-    """Rated torque 0x6076 [mN·m], its limit 0x6072 [‰], and the maker's firmware parameters 0x2001 to 0x2005."""
+    """Rated torque 0x6076 [mN·m], its limit 0x6072 [‰], and our maker's firmware parameters 0x2001 to 0x2005.
+
+    Another maker's drive may have anything at those indices, and no watchdog: it gets option 0x6007 "quick stop"
+    instead, by which it stops when the HAL's heartbeat is missing.
+    """
     drive, safety = joint.drive, description.safety
-    foreign = drive.vendor_id != PROFILE_VENDOR_ID
     per_mille = math.floor(1000.0 * joint.torque_limit / (drive.rated_motor_torque * joint.gear_ratio) * (1.0 + 1e-12))
-    return (
+    torque = (
         SdoWrite(objects.RATED_TORQUE_MNM, 0, round(drive.rated_motor_torque * 1000.0)),
         SdoWrite(objects.MAX_TORQUE, 0, per_mille),
-        SdoWrite(objects.POSITION_GAIN, 0, round(drive.position_gain * 1000.0), foreign),
-        SdoWrite(objects.VELOCITY_GAIN, 0, round(drive.velocity_gain * 1000.0), foreign),
-        SdoWrite(objects.JOINT_TORQUE_LIMIT, 0, round(joint.torque_limit * 1000.0), foreign),
-        SdoWrite(objects.WATCHDOG_CYCLES, 0, safety.sync_timeout_cycles, foreign),
-        SdoWrite(objects.HOLD_RAMP_MS, 0, round(safety.hold_ramp_s * 1000.0), foreign),
+    )
+    if drive.vendor_id != PROFILE_VENDOR_ID:
+        return (*torque, SdoWrite(objects.ABORT_CONNECTION_OPTION, 0, AbortConnectionOption.QUICK_STOP, optional=True))
+    return (
+        *torque,
+        SdoWrite(objects.POSITION_GAIN, 0, round(drive.position_gain * 1000.0)),
+        SdoWrite(objects.VELOCITY_GAIN, 0, round(drive.velocity_gain * 1000.0)),
+        SdoWrite(objects.JOINT_TORQUE_LIMIT, 0, round(joint.torque_limit * 1000.0)),
+        SdoWrite(objects.WATCHDOG_CYCLES, 0, safety.sync_timeout_cycles),
+        SdoWrite(objects.HOLD_RAMP_MS, 0, round(safety.hold_ramp_s * 1000.0)),
     )
 
 

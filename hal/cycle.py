@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from schemas.messages import DriveState, Event, HalStatus, JointCommand, RobotSt
 from schemas.robot import RobotDescription
 
 Severity = Literal["info", "warning", "error"]
+
+SETTLE_S: Final = 0.1
+"""Time that the HAL stays beyond the hold's ramp."""
 
 
 class HalCore:
@@ -100,6 +103,14 @@ class HalCore:
         return HalStatus.SAFE_STOP if self._safe_stop else HalStatus.ACTIVE
 
     @property
+    def cycles_to_hold(self) -> int:
+        """Cycles that the HAL stays when it leaves: until its last target is latched and any holding offset is gone."""
+        waiting = (self._composed, self._sent, self._latched)
+        if self.status is HalStatus.ACTIVE and all(each.torque is None and each.hold is None for each in waiting):
+            return self.robot.command_delay_cycles + 1
+        return round((self.robot.safety.hold_ramp_s + SETTLE_S) * self.robot.rate_hz)
+
+    @property
     def session(self) -> str | None:
         """The controller obeyed."""
         return self._session
@@ -121,12 +132,13 @@ class HalCore:
         Raises:
             ProfileError: a buffer is not a whole number of frames.
         """
+        elapsed = sequence - self._sequence if self._measured is not None else 1
         self._sequence = sequence
         if self._sent.mode is not self._latched.mode:
             self._tell("mode_change", "info", f"mode {self._latched.mode.value} → {self._sent.mode.value}")
         self._latched = self._sent
         measured = self._measured = self._decoder.decode(frames_per_bus)
-        self._predictor.update(measured.position)
+        self._predictor.update(measured.position, elapsed)
         self._review(measured)
         self._update_tuples(measured)
         torque = vector(measured.motor_torque) if self._reports_torque else None
@@ -278,14 +290,8 @@ class HalCore:
     def _controlwords(self, measured: Measured) -> Controlwords:
         if self._supervisor.all_enabled:
             return self._all_enabled
-        states = [DriveState(state) for state in measured.drive_state.tolist()]
-        words = [
-            # A fault is reset by the boot alone, when somebody has looked at its cause.
-            Controlword.DISABLE_VOLTAGE
-            if state is DriveState.FAULT
-            else next_controlword(state, DriveState.OPERATION_ENABLED)
-            for state in states
-        ]
+        keep = self._emergency_stop
+        words = [_controlword(DriveState(state), keep=keep) for state in measured.drive_state.tolist()]
         return np.array(words, dtype=np.uint16)
 
     def _update_tuples(self, measured: Measured) -> None:
@@ -326,3 +332,20 @@ class HalCore:
 
 
 _STATES = tuple(DriveState)
+
+
+def _controlword(state: DriveState, *, keep: bool) -> int:
+    """Controlword for a drive of a stopped robot; `keep`: an emergency stop powers nothing up before its reset."""
+    if state is DriveState.QUICK_STOP_ACTIVE:
+        return Controlword.QUICK_STOP  # "disable voltage" would cut the ramp short
+    if state is DriveState.FAULT or state not in _COMMANDED:
+        return Controlword.DISABLE_VOLTAGE  # a fault is reset by the boot alone, when somebody has looked at its cause
+    return next_controlword(state, state if keep else DriveState.OPERATION_ENABLED)
+
+
+_COMMANDED = (
+    DriveState.SWITCH_ON_DISABLED,
+    DriveState.READY_TO_SWITCH_ON,
+    DriveState.SWITCHED_ON,
+    DriveState.OPERATION_ENABLED,
+)

@@ -36,8 +36,15 @@ class Predictor:
         times = np.arange(1 - HISTORY, 1, dtype=np.float64)
         self._fit = np.linalg.pinv(np.vander(times, 3, increasing=True))
 
-    def update(self, positions: Array) -> None:
-        """Append the positions [rad] of this cycle: kept, not copied."""
+    def update(self, positions: Array, elapsed: int = 1) -> None:
+        """Append the positions [rad] of this cycle, `elapsed` periods after those before: kept, not copied.
+
+        SYNCs that were left out are filled in along the line between both, so that the samples keep their distance.
+        """
+        if elapsed > 1:
+            before = self._history[-1]
+            for missed in range(max(1, elapsed - HISTORY), elapsed):
+                self._history.append(before + (positions - before) * (missed / elapsed))
         self._history.append(positions)
 
     @property

@@ -37,6 +37,8 @@ class Master:
         self._sync = pack(SYNC, b"")
         self._heartbeat = pack(HEARTBEAT + HAL_NODE_ID, bytes([OPERATIONAL]))
         self._heartbeat_cycles = max(1, round(robot.safety.heartbeat_s * robot.rate_hz))
+        self._heartbeat_due = 0
+        """Sequence from which on the next heartbeat is sent: SYNCs may be left out."""
         self._received: list[list[bytes]] = [[] for _ in ports]
         self._missing: list[set[int]] = [set() for _ in ports]
 
@@ -51,15 +53,23 @@ class Master:
         self.core.start(np.array(report.position_measured))
 
     def sync(self, sequence: int) -> None:
-        """Send SYNC on every bus, the HAL's heartbeat before it when one is due."""
-        packet = self._sync if sequence % self._heartbeat_cycles else self._heartbeat + self._sync
+        """Send SYNC on every bus, the HAL's heartbeat before it when one is due.
+
+        What waits from before is taken first: it is decoded with this cycle's reports, but answers no SYNC to come.
+        """
+        for received in self._received:
+            received.clear()
+        for index, frames in self._group.receive(0.0):
+            self._received[index].append(frames)
+        packet = self._sync
+        if sequence >= self._heartbeat_due:
+            self._heartbeat_due = sequence + self._heartbeat_cycles
+            packet = self._heartbeat + self._sync
         for port in self._ports:
             port.send(packet)
 
     def gather(self, sequence: int, timeout_s: float) -> RobotState:
         """Await all reports of this SYNC, up to a time, and decode them; what is missing becomes an event."""
-        for received in self._received:
-            received.clear()
         self._missing = [set(expected) for expected in self.core.expected_reports]
         self._group.gather(self._take, timeout_s)
         return self.core.decode(sequence, [b"".join(received) for received in self._received])

@@ -33,8 +33,6 @@ SIGNALLED: Final = 128
 """Exit code, plus the signal's number, of a run that a signal cut short: the shells' convention."""
 BLAME_S: Final = 0.2
 """Wait after the loss of a bus for the loss of the service that hosted it."""
-SETTLE_S: Final = 0.1
-"""Simulated time that the HAL stays beyond the hold's ramp when it stops a robot."""
 
 
 class SafeStopError(HalError):
@@ -87,15 +85,15 @@ class HalService:
             with suppress(BusLostError):  # a plant that hosts the bus takes it along, and `loss` tells of it
                 self._master.apply(None)
                 self._sequence += 1
-                self._hold(self._ramp_cycles)
+                self._hold(core.cycles_to_hold)
             raise
         except BusLostError:
             self._blame_peers()
             raise
-        finished = core.status is HalStatus.ACTIVE
+        finished, cycles = core.status is HalStatus.ACTIVE, core.cycles_to_hold
         if finished:
             core.leave()
-        self._hold(self._robot.command_delay_cycles + 1 if finished else self._ramp_cycles)
+        self._hold(cycles)
         if not finished and life.signalled is None:
             reason = f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}"
             raise SafeStopError(reason) from core.cause
@@ -113,14 +111,14 @@ class HalService:
             time.sleep(LOOK_UP_S)
 
     @property
-    def _ramp_cycles(self) -> int:
-        return round((self._robot.safety.hold_ramp_s + SETTLE_S) * self._robot.rate_hz)
+    def _report_timeout_s(self) -> float:
+        return 0.5 * self._robot.period_s if self._realtime else REPORT_TIMEOUT_S
 
     def _cycle(self) -> None:
         """One period: SYNC, state out, command in, RPDOs out."""
         self._sync()
         sequence = self._sequence
-        state = self._master.gather(sequence, 0.5 * self._robot.period_s if self._realtime else REPORT_TIMEOUT_S)
+        state = self._master.gather(sequence, self._report_timeout_s)
         self._life.stamp(sequence, state.time_ns)
         self._life.publish(self._keys.state, state)
         self._master.apply(self._await_command(sequence))
@@ -131,7 +129,7 @@ class HalService:
         """Run cycles of the HAL's own: no state is published and no command awaited, the frames are logged."""
         for _ in range(cycles):
             self._sync()
-            self._master.gather(self._sequence, REPORT_TIMEOUT_S)
+            self._master.gather(self._sequence, self._report_timeout_s)
             self._master.apply(None)
             self._sequence += 1
         for message in self._master.frames(self._sequence - 1):

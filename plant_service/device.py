@@ -289,7 +289,7 @@ class DriveDevice:
     # ---- what SDO writes do
 
     def _set_by_sdo(self, key: int) -> None:
-        if key == K_TORQUE:
+        if key == K_TORQUE and self.power.state is OPERATION_ENABLED:
             self._watchdogs.command_ns = self._now_ns
         self._act((key,))
         self._latch()

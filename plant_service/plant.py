@@ -149,7 +149,7 @@ class Plant:
         now_ns = self._now_ns
         answers: list[bytes] = []
         for can_id, data in frames.unpack(packet):
-            if can_id == SYNC:
+            if can_id == SYNC and not data:
                 self._count_sync(bus_index)
                 answers.append(bus.collect(bus.sync(now_ns)))
             else:

@@ -33,7 +33,7 @@ Frames = tuple[tuple[str, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """The worst cycle of one bus: SYNC, what the nodes report, what they are commanded."""
+    """The worst cycle of one bus: SYNC, reports, commands. Heartbeat, EMCY and SDO frames are not counted."""
 
     bus: str
     bitrate: int

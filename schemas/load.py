@@ -67,7 +67,7 @@ def load_run(scenario: str, overrides: dict[str, Any] | None = None) -> Run:
     return Run(robot, config)
 
 
-def load_robot(robot: str, overrides: dict[str, Any] | None = None, *, allow_overload: bool = False) -> Robot:
+def load_robot(robot: str, overrides: dict[str, Any] | None = None) -> Robot:
     """Read and check a robot description (a packaged name or a path) and its URDF.
 
     Raises:
@@ -80,7 +80,7 @@ def load_robot(robot: str, overrides: dict[str, Any] | None = None, *, allow_ove
     urdf = urdf_path.read_text(encoding="utf-8")
     _check_urdf(description, urdf, path, urdf_path)
     for load in bus_loads(description):
-        if load.fraction > 1.0 and not allow_overload:
+        if load.fraction > 1.0:
             raise ConfigurationError(
                 f"{path}: bus {load.bus} is overloaded: {load.explain()}."
                 " Lower rate_hz, move joints to another bus, or add a bus."
@@ -97,7 +97,10 @@ def resolve_urdf(urdf: str, robot_file: Path) -> Path:
     """
     if urdf.startswith("package://"):
         package, _, inner = urdf.removeprefix("package://").partition("/")
-        spec = importlib.util.find_spec(package)
+        try:
+            spec = importlib.util.find_spec(package)
+        except (ImportError, ValueError):
+            spec = None
         if spec is None or not spec.submodule_search_locations:
             raise ConfigurationError(f"{robot_file}: urdf: Python package {package!r} is not installed")
         path = Path(next(iter(spec.submodule_search_locations))) / inner
@@ -115,7 +118,12 @@ def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> 
         ConfigurationError: unknown joint, substep that does not divide the period, λT above 0.3, …
 
     """
+    if round(scenario.duration_s * robot.rate_hz) < 1:
+        raise ConfigurationError(
+            f"{path}: duration_s: {scenario.duration_s:g} s is shorter than a cycle of {robot.period_s:g} s"
+        )
     names = set(robot.joint_names)
+    limits = {joint.name: (joint.position_min, joint.position_max) for joint in robot.joints}
     mentions = [("plant.initial_posture", joint) for joint in scenario.plant.initial_posture]
     mentions += [
         (f"controller.phases.{index}.posture", joint)
@@ -127,6 +135,14 @@ def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> 
             raise ConfigurationError(
                 f"{path}: {field}: robot {robot.name} has no joint {joint!r}; it has {', '.join(robot.joint_names)}"
             )
+    for index, phase in enumerate(scenario.controller.phases):
+        for joint, angle in phase.posture.items():
+            low, high = limits[joint]
+            if not low <= angle <= high:
+                raise ConfigurationError(
+                    f"{path}: controller.phases.{index}.posture.{joint}: {angle:g} rad lies outside"
+                    f" [{low:g}, {high:g}] rad"
+                )
     ratio = robot.period_s / scenario.plant.substep_s
     if not math.isclose(ratio, round(ratio), rel_tol=1e-9) or ratio < 1.0:
         raise ConfigurationError(
@@ -161,10 +177,24 @@ def _find(name: str, folder: str, what: str) -> Path:
     raise ConfigurationError(f"no {what} {name!r}: give a .yaml file or one of {', '.join(known)}")
 
 
+class _UniqueKeys(yaml.SafeLoader):
+    """A field given twice is a mistake; YAML's own rule would be that the last one wins."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key given twice."""
+        keys = [key.value for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+        for key, _ in node.value:
+            if keys.count(key.value) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
+        data = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeys)
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
         raise ConfigurationError(f"{path}: expected a mapping of fields at the top")
@@ -223,7 +253,7 @@ def _check_urdf(robot: RobotDescription, urdf: str, path: Path, urdf_path: Path)
         element = joints.get(joint.name)
         if element is None:
             raise ConfigurationError(f"{path}: joints.{index}.name: {urdf_path.name} has no joint {joint.name!r}")
-        if element.get("type") not in {"revolute", "continuous", "prismatic"}:
+        if element.get("type") not in {"revolute", "continuous"}:
             raise ConfigurationError(
                 f"{path}: joints.{index}: {joint.name} is {element.get('type')} in {urdf_path.name}, expected revolute"
             )

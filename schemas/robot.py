@@ -22,7 +22,8 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 class Bus(Model):
     """One CAN bus, opened by python-can as `can.Bus(interface=…, channel=…, bitrate=…)`."""
 
-    name: str
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+    """Part of a Zenoh key and of a log's topic."""
     interface: str = "cosim"
     channel: str
     """For `cosim` a socket path; a bare name lies in the run directory. For `socketcan` the interface's name."""

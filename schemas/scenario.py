@@ -73,6 +73,7 @@ class Scenario(Model):
     clock: Clock = Clock.LOCKSTEP
     duration_s: PositiveFloat
     seed: Annotated[int, Field(ge=0)] = 0
-    namespace: str = "cosim"
+    namespace: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = "cosim"
+    """First part of all Zenoh keys."""
     plant: PlantConfig = PlantConfig()
     controller: ControllerConfig

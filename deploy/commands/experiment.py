@@ -30,6 +30,7 @@ def experiment(
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
+    from deploy.errors import UsageError
     from deploy.experiment import ExperimentRequest, combine, find_experiment
 
     run = find_experiment(name)
@@ -55,7 +56,10 @@ def experiment(
                 display.update(task, completed=index + share, description=what, seed=seed + index)
 
             place = directory if seeds == 1 else directory / f"seed-{seed + index}"
-            place.mkdir(parents=True, exist_ok=True)
+            try:
+                place.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise UsageError(f"--out {place}: cannot be made: {error.strerror}") from error
             results.append(run(ExperimentRequest(seed + index, overrides, place, processes, tell)))
             opt.write_json(results[-1].as_json(), place / "metrics.json")
     if json_:

@@ -29,7 +29,7 @@ Bus = Annotated[
 BasePort = Annotated[
     int | None, typer.Option(min=1024, max=65000, help="First of the run's consecutive loopback TCP ports.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Output directory.")]
 
 SOCKETCAN_NAMES = ("can", "vcan", "slcan")

@@ -59,14 +59,18 @@ def _command(name: str) -> Callable[..., None]:
         port = base_port if base_port is not None else TransportConfig().base_port
         if service is Service.RECORDER and output is None:
             output = Path(f"{run.scenario.name}.mcap")
+        if service is Service.RECORDER and output is not None and output.exists():
+            raise UsageError(f"--output {output}: exists; give another or remove it")
         choice = ServiceOptions(port, session or session_identity(run), expected, sessions.runtime_root(), output)
+        note = sessions.describe(run, choice, Path.cwd())
         if service is Service.HAL:
-            sessions.announce(sessions.describe(run, choice, Path.cwd()))
+            sessions.refuse_taken(port)
+            sessions.announce(note)
         try:
             code = run_service(service, run, choice)
         finally:
             if service is Service.HAL:
-                (choice.run_directory / sessions.NOTE).unlink(missing_ok=True)
+                sessions.withdraw(note)
         raise typer.Exit(code)
 
     return command

@@ -195,7 +195,8 @@ def next_controlword(state: DriveState, target: DriveState) -> int:
     """Controlword for one step from a state towards a target, or that stays there.
 
     From Fault the step is the reset: whoever may not reset faults must not ask. It needs bit 7 low in the controlword
-    before. In the states a drive leaves by itself the answer is `DISABLE_VOLTAGE`, which does nothing there.
+    before. In the states a drive leaves by itself the answer is `DISABLE_VOLTAGE`, which does nothing there but in
+    Quick Stop Active, whose ramp it ends.
 
     Args:
         state: what the drive reports.
