@@ -125,3 +125,17 @@ def test_doctor_json_is_one_object(capsys: pytest.CaptureFixture[str]) -> None:
     assert diagnosis["fits"] is True
     assert len(diagnosis["joints"]) == 9
     assert [bus["name"] for bus in diagnosis["buses"]] == ["arm9-0", "arm9-1", "arm9-2"]
+
+
+def test_record_overwrites_no_log(
+    runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("deploy.services.run_service", lambda *_: 0)
+    monkeypatch.chdir(tmp_path)
+    line = ["record", "--scenario", "arm9-transition"]
+    for path, option in ((tmp_path / "mine.mcap", ["--output", "mine.mcap"]), (tmp_path / "arm9-transition.mcap", [])):
+        assert main([*line, *option]) == 0
+        path.write_bytes(b"log")
+        assert main([*line, *option]) == 2
+        assert f"{path.name}: exists" in capfd.readouterr().err
+        assert path.read_bytes() == b"log"

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from deploy import session
+from deploy.cli import main as cli
 from deploy.errors import LaunchError, UsageError
 from deploy.launcher import LOG_NAME, output_directory, plan
 from deploy.run_file import read_run, write_run
@@ -96,3 +97,34 @@ def test_an_existing_log_is_not_overwritten(run: Run, tmp_path: Path, monkeypatc
     assert second != first
     with pytest.raises(UsageError, match="exists"):
         output_directory(run, first, now)
+
+
+def test_notes_of_two_robots_lie_side_by_side(run: Run, runtime: Path, tmp_path: Path) -> None:
+    options = plan(run, tmp_path, base_port=20480).options
+    # Robots started service by service share the directory of bare bus channels.
+    notes = [
+        session.describe(run, replace(options, base_port=port, run_directory=session.runtime_root()), tmp_path)
+        for port in (20480, 20490)
+    ]
+    for note in notes:
+        session.announce(note)
+    assert session.running_sessions() == notes
+    session.withdraw(notes[0])
+    assert session.running_sessions() == notes[1:]
+
+
+def test_the_ports_of_a_run_are_refused_and_its_files_stay(
+    run: Run, runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared = plan(run, tmp_path, base_port=20480)
+    other = replace(session.describe(run, prepared.options, tmp_path), pid=os.getppid())
+    session.announce(other)
+    socket_file = prepared.options.run_directory / "can0"
+    socket_file.touch()
+    with pytest.raises(UsageError, match=rf"20480: taken by {run.scenario.name} \(process {os.getppid()}\)"):
+        plan(run, tmp_path, base_port=20480)
+    monkeypatch.setattr("deploy.services.run_service", lambda *_: 0)
+    assert cli(["hal", "--scenario", "arm9-transition", "--base-port", "20480"]) == 2
+    assert session.running_sessions() == [other]
+    assert socket_file.exists()
+    assert plan(run, tmp_path, base_port=20490).options.base_port == 20490

@@ -8,8 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.boot_objects import interpolation_period, pdo_writes
+from hal.boot_objects import (
+    PROFILE_VENDOR_ID,
+    communication_writes,
+    drive_writes,
+    interpolation_period,
+    pdo_writes,
+)
 from schemas.robot import Drive
+from tests.hal.robots import robot
 
 
 def drive(kind: str, vendor_id: int = 0x402) -> Drive:
@@ -70,3 +77,19 @@ def test_presets_of_other_makers_are_made_invalid_where_they_exist() -> None:
         (0x1802, 0xC0000384, True),
         (0x1803, 0xC0000484, True),
     }
+
+
+def test_another_makers_drive_gets_no_parameter_of_ours() -> None:
+    def written(vendor_id: int) -> dict[int, int]:
+        description = robot("torque", drive={"vendor_id": vendor_id})
+        joint = description.joints[0]
+        writes = [*communication_writes(description, joint.drive), *drive_writes(description, joint)]
+        return {write.index: write.value for write in [*writes, *pdo_writes(joint.drive)]}
+
+    def own_range(writes: dict[int, int]) -> list[int]:
+        return [index for index in writes if 0x2000 <= index < 0x6000]
+
+    assert own_range(written(PROFILE_VENDOR_ID)) == [0x2001, 0x2002, 0x2003, 0x2004, 0x2005]
+    foreign = written(0xFB)
+    assert own_range(foreign) == []
+    assert foreign[0x6007] == 3  # quick stop when the heartbeat is missing

@@ -189,3 +189,23 @@ def test_nine_drives_boot_quickly_over_the_virtual_bus(plant: Plant, served: lis
     report = boot_network(plant.robot, served)
     assert time.monotonic() - start < 2.0
     assert [drive.node_id for drive in report.drives] == list(range(1, 10))
+
+
+def test_a_failed_boot_leaves_no_drive_powered(plant: Plant) -> None:
+    devices = [device for of_bus in plant.devices for device in of_bus]
+    last = devices[-1]
+    powered: set[int] = set()
+
+    def deliver(bus: int, frames: bytes) -> bytes:
+        powered.update(
+            d.node_id for devices in plant.devices for d in devices if d.state is DriveState.OPERATION_ENABLED
+        )
+        if last.state is DriveState.SWITCHED_ON:
+            last.fault(0x2310)
+        return plant.answer(bus, frames)
+
+    ports = [DirectPort(f"bus{bus}", lambda frames, bus=bus: deliver(bus, frames)) for bus in range(3)]
+    with pytest.raises(BootError, match=r"joint8 .*0x2310"):
+        boot_network(plant.robot, ports, timeout_s=0.05)
+    assert powered == set(range(1, 9))
+    assert [device.state for device in devices] == [DriveState.SWITCH_ON_DISABLED] * 8 + [DriveState.FAULT]

@@ -72,3 +72,18 @@ def test_a_hold_ramps_to_nothing_and_starts_and_ends_without_slope() -> None:
 
 def test_the_ramp_lasts_hold_ramp_s() -> None:
     assert HoldingRule(robot("torque")).cycles == 10
+
+
+@pytest.mark.parametrize("elapsed", [2, 3, HISTORY + 4])
+def test_left_out_syncs_keep_the_velocity(elapsed: int) -> None:
+    period, speed = 0.002, 1.7
+    predictor = Predictor(np.zeros(1), period)
+    cycle = 0
+    for step in [1] * HISTORY + [elapsed, 1, elapsed]:
+        cycle += step
+        predictor.update(np.array([speed * cycle * period]), step)
+        if cycle >= HISTORY:
+            assert predictor.mean_velocity[0] == pytest.approx(speed, abs=1e-9)
+            ahead, velocity = predictor.ahead(1)
+            assert ahead[0] == pytest.approx(speed * (cycle + 1) * period, abs=1e-9)
+            assert velocity[0] == pytest.approx(speed, abs=1e-6)

@@ -209,3 +209,19 @@ def test_a_tick_is_never_late_for_what_became_due_after_the_tick_before(bench):
     bench.write(0x1017, 0, 0, 2)
     bench.device.fault(0x5400)
     assert [can_id for can_id, _ in bench.wait(1)] == [0x085]
+
+
+@pytest.mark.parametrize("mode", [8, 10])
+def test_a_target_torque_by_sdo_before_enabling_arms_no_watchdog(bench, mode):
+    bench.write(0x1006, 0, 1000, 4)
+    assert bench.write(0x6071, 0, 0, 2) == 0
+    bench.wait(50)
+    bench.enable(8)
+    for _ in range(50):
+        bench.wait(1)
+        if mode == 10:
+            bench.command_torque(0)
+        bench.sync()
+    assert emcys(bench.said) == []
+    assert bench.device.state is S.OPERATION_ENABLED
+    assert not bench.device.power.left_alone

@@ -144,3 +144,17 @@ def test_same_calls_same_bytes(run):
         return said
 
     assert record() == record()
+
+
+def test_a_sync_with_data_is_an_error_and_no_sync(run, plant):
+    sync_all(plant)
+    plant.advance()
+    sequence = plant.sequence
+    answers = list(unpack(plant.deliver(0, pack(0x080, b"\x01"))))
+    assert [(can_id, data[:2]) for can_id, data in answers] == [
+        (0x080 + node, b"\x40\x82") for node in sorted(nodes_of(run)[0])
+    ]
+    assert plant.sequence == sequence
+    assert not plant.sync_complete
+    reports = {can_id for can_id, _ in unpack(plant.deliver(0, SYNC))}
+    assert {0x180 + node for node in nodes_of(run)[0]} <= reports

@@ -119,3 +119,63 @@ def test_overrides_reach_robot_and_scenario(files: Any) -> None:
 def test_override_of_what_does_not_exist_is_refused(files: Any, path: str) -> None:
     with pytest.raises(ConfigurationError, match=path.split(".")[0]):
         files.load(**{path: 1.0})
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "expected"),
+    [
+        (
+            "scenario.controller.phases.0.posture",
+            {"shoulder": 3.0},
+            "controller.phases.0.posture.shoulder: 3 rad lies outside [-1.5, 1.5] rad",
+        ),
+        ("scenario.duration_s", 0.0005, "duration_s: 0.0005 s is shorter than a cycle of 0.002 s"),
+        ("scenario.namespace", "a/b", "namespace: String should match"),
+        ("scenario.namespace", "", "namespace: String should match"),
+        ("scenario.namespace", "a*", "namespace: String should match"),
+        (
+            "robot.buses",
+            [{"name": name, "channel": name} for name in ("can0", "can1", "can/2")],
+            "buses.2.name: String should match",
+        ),
+        ("robot.urdf", "package://no.such.package/a.urdf", "'no.such.package' is not installed"),
+        ("robot.urdf", "package:///a.urdf", "'' is not installed"),
+    ],
+)
+def test_what_could_not_run_is_refused(files: Any, path: str, value: Any, expected: str) -> None:
+    _set(path, value)(files)
+    with pytest.raises(ConfigurationError) as caught:
+        files.load()
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("angle", [-1.5, 1.5])
+def test_a_posture_may_lie_at_a_limit(files: Any, angle: float) -> None:
+    files.scenario["controller"]["phases"][0]["posture"] = {"elbow": angle}
+    assert files.load().scenario.controller.phases[0].posture == {"elbow": angle}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("hold.yaml", b"\nseed: 8\n", "'seed' is given twice"),
+        ("hold.yaml", b"plant: {seed: 8, seed: 8}\n", "'seed' is given twice"),
+        ("pendulum.yaml", b"\nrate_hz: 250.0\n", "'rate_hz' is given twice"),
+        ("hold.yaml", b"# \xff\xfe\n", "not valid YAML"),
+    ],
+)
+def test_doubled_fields_and_bad_bytes_name_the_file(files: Any, name: str, text: bytes, expected: str) -> None:
+    files.load()
+    path = files.folder / name
+    path.write_bytes(path.read_bytes() + text)
+    with pytest.raises(ConfigurationError, match=rf"{name}: not valid YAML") as caught:
+        load_run(str(files.folder / "hold.yaml"))
+    assert expected in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["prismatic", "floating", "planar"])
+def test_joints_that_do_not_turn_are_refused(files: Any, kind: str) -> None:
+    files.urdf = files.urdf.replace('name="elbow" type="revolute"', f'name="elbow" type="{kind}"')
+    with pytest.raises(ConfigurationError, match=rf"joints\.1: elbow is {kind} in pendulum\.urdf, expected revolute"):
+        files.load()
