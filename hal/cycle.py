@@ -17,10 +17,10 @@ from hal.expected import expected_reports
 from hal.guard import MotionGuard
 from hal.holding import Predictor
 from hal.limits import Onsets
-from hal.profile.cia402 import Controlword, OperationMode, next_controlword
+from hal.profile.cia402 import Controlword, OperationMode
 from hal.profile.units import Array
 from hal.setpoint import HAL_DECIDED, Setpoint, vector
-from hal.supervision import Supervisor
+from hal.supervision import Supervisor, controlword
 from schemas.base import ControlMode
 from schemas.messages import DriveState, Event, HalStatus, JointCommand, RobotState
 from schemas.robot import RobotDescription
@@ -291,7 +291,7 @@ class HalCore:
         if self._supervisor.all_enabled:
             return self._all_enabled
         keep = self._emergency_stop
-        words = [_controlword(DriveState(state), keep=keep) for state in measured.drive_state.tolist()]
+        words = [controlword(DriveState(state), keep=keep) for state in measured.drive_state.tolist()]
         return np.array(words, dtype=np.uint16)
 
     def _update_tuples(self, measured: Measured) -> None:
@@ -332,20 +332,3 @@ class HalCore:
 
 
 _STATES = tuple(DriveState)
-
-
-def _controlword(state: DriveState, *, keep: bool) -> int:
-    """Controlword for a drive of a stopped robot; `keep`: an emergency stop powers nothing up before its reset."""
-    if state is DriveState.QUICK_STOP_ACTIVE:
-        return Controlword.QUICK_STOP  # "disable voltage" would cut the ramp short
-    if state is DriveState.FAULT or state not in _COMMANDED:
-        return Controlword.DISABLE_VOLTAGE  # a fault is reset by the boot alone, when somebody has looked at its cause
-    return next_controlword(state, state if keep else DriveState.OPERATION_ENABLED)
-
-
-_COMMANDED = (
-    DriveState.SWITCH_ON_DISABLED,
-    DriveState.READY_TO_SWITCH_ON,
-    DriveState.SWITCHED_ON,
-    DriveState.OPERATION_ENABLED,
-)

@@ -12,13 +12,13 @@ from hal.bus.ports import open_port
 from hal.errors import HalError
 from hal.master import Master
 from schemas.base import Clock
-from schemas.lifecycle import Lifecycle, PeerLostError
+from schemas.lifecycle import Lifecycle
 from schemas.load import Run
 from schemas.messages import HalStatus, JointCommand, OperatorRequest, RobotState
 from schemas.service import ServiceOptions
 from schemas.statistics import CycleMeter
 from schemas.topics import MalformedMessageError, decode
-from schemas.transport import open_service
+from schemas.transport import PeerLostError, open_service
 
 CONNECT_S: Final = 30.0
 """Patience with a plant that is still starting."""

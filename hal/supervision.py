@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 import numpy.typing as npt
 
 from hal.decode import Measured, Notice
-from hal.profile.cia402 import OperationMode
+from hal.profile.cia402 import Controlword, OperationMode, next_controlword
 from schemas.messages import DriveState
 from schemas.robot import RobotDescription
 
@@ -120,3 +122,21 @@ class Supervisor:
             for name in sorted(self._silent_sensors - silent)
         )
         self._silent_sensors = silent
+
+
+_COMMANDED: Final = (
+    DriveState.SWITCH_ON_DISABLED,
+    DriveState.READY_TO_SWITCH_ON,
+    DriveState.SWITCHED_ON,
+    DriveState.OPERATION_ENABLED,
+)
+"""States that a drive leaves by command alone."""
+
+
+def controlword(state: DriveState, *, keep: bool) -> int:
+    """Controlword for a drive of a stopped robot; `keep`: an emergency stop powers nothing up before its reset."""
+    if state is DriveState.QUICK_STOP_ACTIVE:
+        return Controlword.QUICK_STOP  # "disable voltage" would cut the ramp short
+    if state not in _COMMANDED:
+        return Controlword.DISABLE_VOLTAGE  # a fault is reset by the boot alone, when somebody has looked at its cause
+    return next_controlword(state, state if keep else DriveState.OPERATION_ENABLED)

@@ -12,12 +12,12 @@ from hal.profile.frames import view
 from hal.profile.identifiers import SYNC
 from plant_service.plant import Plant
 from schemas.base import Clock
-from schemas.lifecycle import Lifecycle, PeerLostError
+from schemas.lifecycle import Lifecycle
 from schemas.load import Run
 from schemas.robot import Bus
 from schemas.service import ServiceOptions
 from schemas.statistics import CycleMeter
-from schemas.transport import open_service
+from schemas.transport import PeerLostError, open_service
 
 LOOK_UP_S: Final = 0.1
 """How often signals and peers are looked at while the bus is silent."""

@@ -8,20 +8,15 @@ from types import FrameType, TracebackType
 from typing import Final, Literal, Self
 
 from schemas.base import Model
-from schemas.errors import CosimError
 from schemas.messages import Event
 from schemas.topics import decode
-from schemas.transport import Transport
+from schemas.transport import PeerLostError, Transport
 
 JOIN_TIMEOUT_S: Final = 60.0
 """Patience with peers that are still starting: imports alone take seconds on a slow machine."""
 FAREWELL_S: Final = 0.1
 """A peer's last word may arrive this long after its token has gone."""
 STOPPED: Final = "service_stopped"
-
-
-class PeerLostError(CosimError):
-    """A service that the run needs has vanished without a last word."""
 
 
 class Lifecycle:
@@ -46,7 +41,7 @@ class Lifecycle:
 
         Raises:
             PeerTimeoutError: naming those that are missing.
-            PeerLostError: of `schemas.transport`: one has ended while the run was starting.
+            PeerLostError: one has ended while the run was starting.
             JoinCancelledError: a signal came first.
 
         """

@@ -13,10 +13,10 @@ import pytest
 from deploy.session import free_base_port
 from schemas.base import Clock
 from schemas.keys import Keys
-from schemas.lifecycle import STOPPED, Lifecycle, PeerLostError
+from schemas.lifecycle import STOPPED, Lifecycle
 from schemas.messages import Event
 from schemas.topics import decode
-from schemas.transport import Transport, TransportConfig, open_session
+from schemas.transport import PeerLostError, Transport, TransportConfig, open_session
 
 KEYS = Keys("test", "lifecycle")
 
