@@ -5,10 +5,11 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 BIN := .venv/bin
 STAMP := .venv/.installed
 PACKAGES := schemas hal plant_service controller_service deploy experiments benchmarks
+COMMAND ?= ip -brief link
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 
-.PHONY: run test lint bench nightly golden clean
+.PHONY: run test lint bench nightly golden can-vm clean
 
 run: $(STAMP)
 	$(BIN)/cosim up arm9-transition
@@ -29,6 +30,9 @@ nightly: $(STAMP)
 
 golden: $(STAMP)
 	$(BIN)/python -m deploy.golden
+
+can-vm: $(STAMP)
+	$(BIN)/cosim can-vm -- sh -c '$(COMMAND)'
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

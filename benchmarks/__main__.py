@@ -13,6 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.kernel_can import kernel_ports
 from benchmarks.measure import Figures
 from benchmarks.stages import bus_round_trip, one_process, separate_processes, zenoh_round_trip
 from benchmarks.yardstick import yardsticks
@@ -36,6 +37,7 @@ def main() -> int:
     stages = list(one.stages)
     with console.status("bus"):
         stages.append(bus_round_trip(chosen.cycles).figures())
+    stages += [timing.figures() for timing in kernel_ports("vcan0", chosen.cycles)]
     with console.status("Zenoh"):
         stages.append(zenoh_round_trip(chosen.cycles).figures())
     with console.status("separate processes"):

@@ -8,79 +8,69 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from schemas.bus_load import BusLoad, bus_loads
-from schemas.robot import Joint, RobotDescription
+from deploy.measured import Comparison, comparison_table
+from schemas.bus_load import CyclePlan, cycle_plan
+from schemas.robot import Bus, Joint, RobotDescription
 
 DEGREES = 57.29577951308232
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Loads and the time a cycle takes at worst: slowest reports, computing, slowest commands."""
+    """A robot, its worst cycle, and what a log says of its buses."""
 
     robot: RobotDescription
-    loads: tuple[BusLoad, ...]
+    plan: CyclePlan
+    comparisons: tuple[Comparison, ...] = ()
 
     @property
-    def report_time_s(self) -> float:
-        """SYNC and reports on the slowest bus."""
-        return max(load.report_time_s for load in self.loads)
+    def excesses(self) -> tuple[str, ...]:
+        """What was measured above the worst case, a line each."""
+        return tuple(line for each in self.comparisons for line in each.excesses())
 
     @property
-    def command_time_s(self) -> float:
-        """Commands on the slowest bus."""
-        return max(load.command_time_s for load in self.loads)
+    def losses(self) -> tuple[str, ...]:
+        """What was late or replaced, a line a bus."""
+        return tuple(line for each in self.comparisons if (line := each.measured.complaint()))
 
     @property
-    def needed_s(self) -> float:
-        """From SYNC to the end of the last command frame."""
-        return self.report_time_s + self.robot.compute_budget_s + self.command_time_s
-
-    @property
-    def available_s(self) -> float:
-        """From SYNC to the SYNC that latches the command."""
-        return self.robot.command_delay_cycles * self.robot.period_s
-
-    @property
-    def fits(self) -> bool:
-        """Commands arrive before the SYNC that latches them, and no bus is over 100 %."""
-        return self.needed_s <= self.available_s and all(load.fraction <= 1.0 for load in self.loads)
-
-    def timing(self) -> str:
-        """Spell out the arithmetic in one line."""
-        relation = "≤" if self.needed_s <= self.available_s else ">"
-        return (
-            f"reports {_ms(self.report_time_s)} + compute {_ms(self.robot.compute_budget_s)}"
-            f" + commands {_ms(self.command_time_s)} = {_ms(self.needed_s)} {relation} {_ms(self.available_s)}"
-            f" = {self.robot.command_delay_cycles} × {_ms(self.robot.period_s)}"
-        )
+    def healthy(self) -> bool:
+        """The plan fits, and nothing measured contradicts it."""
+        return self.plan.fits and not self.excesses and not self.losses
 
     def as_json(self) -> dict[str, Any]:
         """Everything as plain values, SI units in the names."""
-        robot = self.robot
+        robot, plan = self.robot, self.plan
+        measured = {each.load.bus: each.as_json() for each in self.comparisons}
         return {
             "robot": robot.name,
             "rate_hz": robot.rate_hz,
             "command_delay_cycles": robot.command_delay_cycles,
-            "fits": self.fits,
+            "fits": plan.fits,
+            "faults": list(plan.faults()),
+            "above_worst_case": list(self.excesses),
             "timing": {
-                "report_time_s": self.report_time_s,
-                "compute_budget_s": robot.compute_budget_s,
-                "command_time_s": self.command_time_s,
-                "needed_s": self.needed_s,
-                "available_s": self.available_s,
+                "report_time_s": plan.report_time_s,
+                "compute_budget_s": plan.compute_budget_s,
+                "command_time_s": plan.command_time_s,
+                "needed_s": plan.needed_s,
+                "available_s": plan.available_s,
+                "blocking_s": plan.blocking_s,
             },
             "buses": [
                 {
                     "name": load.bus,
                     "bitrate": load.bitrate,
                     "worst_case_bits": load.bits,
+                    "heartbeat_bits": load.heartbeat_bits,
                     "worst_case_load": load.fraction,
+                    "worst_cycle_load": load.peak_fraction,
                     "report_time_s": load.report_time_s,
                     "command_time_s": load.command_time_s,
                     "arithmetic": load.explain(),
                 }
-                for load in self.loads
+                | measured.get(load.bus, {})
+                for load in plan.loads
             ],
             "joints": [
                 joint.model_dump(mode="json") | {"torque_limit_per_mille": per_mille(joint)} for joint in robot.joints
@@ -91,9 +81,9 @@ class Diagnosis:
         }
 
 
-def examine(robot: RobotDescription) -> Diagnosis:
+def examine(robot: RobotDescription, comparisons: tuple[Comparison, ...] = ()) -> Diagnosis:
     """Compute loads and timing."""
-    return Diagnosis(robot, bus_loads(robot))
+    return Diagnosis(robot, cycle_plan(robot), comparisons)
 
 
 def per_mille(joint: Joint) -> float:
@@ -101,8 +91,9 @@ def per_mille(joint: Joint) -> float:
     return 1000.0 * joint.torque_limit / (joint.drive.rated_motor_torque * joint.gear_ratio)
 
 
-def show(robot: RobotDescription, diagnosis: Diagnosis, console: Console) -> None:
-    """Print the tables."""
+def show(diagnosis: Diagnosis, console: Console) -> None:
+    """Print the tables, the arithmetic and the verdict."""
+    robot, plan = diagnosis.robot, diagnosis.plan
     console.print(
         f"[bold]{robot.name}[/]: {len(robot.joints)} joints, {len(robot.buses)} buses, {robot.rate_hz:g} Hz,"
         f" commands take effect at SYNC {robot.command_delay_cycles} after the measured one; hand frame"
@@ -111,8 +102,9 @@ def show(robot: RobotDescription, diagnosis: Diagnosis, console: Console) -> Non
     console.print(_joint_table(robot))
     console.print(_limit_table(robot))
     console.print(_bus_table(diagnosis))
-    for load in diagnosis.loads:
+    for load in plan.loads:
         console.print(f"{load.bus}: {load.explain()}", highlight=False, soft_wrap=True)
+    console.print("busiest cycle: all heartbeats, and after the boot the mode of every drive, fall into the worst one")
     if robot.force_torque_sensors or robot.imus:
         console.print(_sensor_table(robot))
     safety = robot.safety
@@ -122,10 +114,24 @@ def show(robot: RobotDescription, diagnosis: Diagnosis, console: Console) -> Non
         f" hold ramp {safety.hold_ramp_s:g} s, heartbeat {safety.heartbeat_s:g} s",
         soft_wrap=True,
     )
-    verdict = "[green]fits[/]" if diagnosis.fits else "[red]does not fit[/]"
-    console.print(f"timing {verdict}: {diagnosis.timing()}", soft_wrap=True)
-    if not diagnosis.fits:
-        console.print("raise command_delay_cycles, lower rate_hz or compute_budget_s, or spread joints over buses")
+    verdict = "[green]fits[/]" if plan.in_time else "[red]does not fit[/]"
+    console.print(f"timing {verdict}: {plan.timing()}", soft_wrap=True)
+    if plan.fits and not plan.in_time_if_blocked:
+        console.print(
+            f"a heartbeat on the bus delays SYNC and commands by up to {plan.blocking_s * 1e3:.3f} ms each: where both"
+            " meet one, a worst cycle's commands may be late",
+            soft_wrap=True,
+        )
+    for load in plan.overloaded:
+        console.print(f"load [red]does not fit[/]: bus {load.bus} is overloaded, {load.fraction:.1%}", soft_wrap=True)
+    if not plan.fits:
+        console.print(f"to make it fit: {plan.remedies()}", soft_wrap=True)
+    if diagnosis.comparisons:
+        console.print(comparison_table(diagnosis.comparisons))
+        for line in diagnosis.losses:
+            console.print(f"[red]lost[/]: {line}", soft_wrap=True)
+        for line in diagnosis.excesses:
+            console.print(f"[red]above worst case[/]: {line}", soft_wrap=True)
 
 
 def _joint_table(robot: RobotDescription) -> Table:
@@ -172,18 +178,19 @@ def _bus_table(diagnosis: Diagnosis) -> Table:
     table = Table(title="buses, worst case", title_justify="left")
     for header in ("bus", "opened as"):
         table.add_column(header, no_wrap=True)
-    for header in ("Mbit/s", "nodes", "reports ms", "commands ms", "load"):
+    for header in ("Mbit/s", "nodes", "reports ms", "commands ms", "load", "busiest\ncycle"):
         table.add_column(header, justify="right")
-    for bus, load in zip(diagnosis.robot.buses, diagnosis.loads, strict=True):
+    for bus, load in zip(diagnosis.robot.buses, diagnosis.plan.loads, strict=True):
         nodes = sum(joint.drive.bus == bus.name for joint in diagnosis.robot.joints)
         table.add_row(
             bus.name,
-            f"{bus.interface}:{bus.channel}",
+            _opened(bus),
             f"{bus.bitrate / 1e6:g}",
             str(nodes),
             f"{load.report_time_s * 1e3:.3f}",
             f"{load.command_time_s * 1e3:.3f}",
-            f"{load.fraction:.0%}",
+            f"{load.fraction:.1%}",
+            f"{load.peak_fraction:.1%}",
         )
     return table
 
@@ -202,5 +209,6 @@ def _sensor_table(robot: RobotDescription) -> Table:
     return table
 
 
-def _ms(seconds: float) -> str:
-    return f"{seconds * 1e3:.3f} ms"
+def _opened(bus: Bus) -> str:
+    plant = "" if bus.plant_channel is None else f" (plant {bus.plant_channel})"
+    return f"{bus.interface}:{bus.channel}{plant}"

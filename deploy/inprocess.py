@@ -14,6 +14,7 @@ from schemas.base import Model
 from schemas.load import Run
 from schemas.messages import HalStatus, RobotState
 from schemas.service import session_identity
+from schemas.topics import BUS_PREFIX, LOAD_PREFIX
 
 BOOT_S: Final = 5.0
 _NO_WAIT: Final = 0.0
@@ -80,6 +81,7 @@ class InProcess:
             self._advance()
             self.master.apply(None)
             self._close_cycle()
+        self._log_loads(final=True)
 
     def _exchange(self) -> RobotState:
         self.master.sync(self.sequence)
@@ -88,6 +90,7 @@ class InProcess:
     def _advance(self) -> None:
         self._sink("truth", self.plant.truth())
         self.plant.advance()
+        self._log_loads()
 
     def _close_cycle(self) -> None:
         self._log_frames(self.sequence)
@@ -95,6 +98,10 @@ class InProcess:
             self._sink("event", event)
         self.sequence += 1
 
+    def _log_loads(self, *, final: bool = False) -> None:
+        for statistics in self.plant.statistics(final=final):
+            self._sink(LOAD_PREFIX + statistics.bus, statistics)
+
     def _log_frames(self, sequence: int) -> None:
         for frames in self.master.frames(sequence):
-            self._sink(f"bus/{frames.bus}", frames)
+            self._sink(BUS_PREFIX + frames.bus, frames)

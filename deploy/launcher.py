@@ -14,7 +14,7 @@ from deploy import session as sessions
 from deploy.errors import ChildDiedError, UsageError
 from deploy.progress import Monitor, RunProgress
 from deploy.run_file import write_run
-from deploy.services import arguments
+from deploy.services import arguments, said_by
 from deploy.supervisor import Child, Supervisor, service_environment
 from schemas.load import Run
 from schemas.service import Service, ServiceOptions, session_identity
@@ -182,22 +182,29 @@ def _mourn(supervisor: Supervisor, monitor: Monitor, progress: RunProgress) -> N
         ChildDiedError: unless the HAL turns out to have ended the run at the same moment.
 
     """
-    cause = next(child for child in supervisor.ended() if child.service is not Service.RECORDER)
-    code = cause.process.returncode
+    cause = _first_to_blame(supervisor)
     supervisor.wait([Service.PLANT, Service.HAL, Service.CONTROLLER], GRACE_SECONDS)
     progress.show(monitor.poll())
+    if cause.process.returncode == 0:
+        # Who ends in peace has heard another's goodbye; that one may take a moment longer to end, and says why.
+        cause = _first_to_blame(supervisor)
+    code = cause.process.returncode
     hal = supervisor.children[Service.HAL].process
     if code == 0 and hal.poll() == 0:
         return
     supervisor.stop()
     witnesses = [
-        f"{child.service}: {words}"
+        said_by(child.service, words)
         for child in _others(supervisor, cause)
         if (words := child.last_words(1)) and child.process.returncode > 0
     ]
     early = " before the run was over" if code == 0 else ""
     rest = "; ".join(witnesses) or "the other services were stopped"
     raise ChildDiedError(f"{cause.epitaph()}{early}\n{rest}")
+
+
+def _first_to_blame(supervisor: Supervisor) -> Child:
+    return next(child for child in supervisor.ended() if child.service is not Service.RECORDER)
 
 
 def _others(supervisor: Supervisor, cause: Child) -> list[Child]:

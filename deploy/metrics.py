@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from deploy.loads import BusMetrics, bus_metrics
 from deploy.series import Array, Integers, RunSeries, TraceSeries, TruthSeries
+from schemas.bus_load import cycle_plan
 from schemas.statistics import percentile
 
 CSP = 8
@@ -60,6 +62,10 @@ class RunMetrics:
     hand_error_rms_m: float | None
     hand_error_max_m: float | None
     mode_changes: tuple[ModeChange, ...]
+    buses: tuple[BusMetrics, ...] = ()
+    """Measured timing of each bus, where the plant simulates the wire."""
+    plan_fits: bool = True
+    """The buses can carry the robot's plan (`schemas.bus_load`)."""
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -99,6 +105,8 @@ def summarize(series: RunSeries) -> RunMetrics:
         hand_error_rms_m=float(np.sqrt(np.mean(errors**2))) if errors.size else None,
         hand_error_max_m=float(errors.max()) if errors.size else None,
         mode_changes=mode_changes(series.truth, limits),
+        buses=bus_metrics(series.run.robot.description, series.bus_statistics),
+        plan_fits=cycle_plan(series.run.robot.description).fits,
     )
 
 

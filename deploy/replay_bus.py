@@ -12,7 +12,7 @@ from deploy.compare import HAL, PLANT, Difference, Tolerances, compare
 from deploy.replay import ReplayError
 from hal.cycle import HalCore
 from hal.profile.frames import FRAME_BYTES, unpack
-from hal.profile.identifiers import SYNC
+from hal.profile.identifiers import HAL_NODE_ID, HEARTBEAT, SYNC
 from plant_service.plant import Plant
 from schemas.base import Clock
 from schemas.log import LogReader
@@ -195,10 +195,16 @@ def _after_sync(packet: bytes) -> bytes:
 
 
 def _sync_end(packet: bytes) -> int:
+    """Where the commands begin: after the SYNC, and the HAL's heartbeat if it goes with it."""
+    end, synced = 0, False
     for index, (can_id, _) in enumerate(unpack(packet)):
         if can_id == SYNC:
-            return (index + 1) * FRAME_BYTES
-    return 0
+            synced = True
+        elif synced and can_id != HEARTBEAT + HAL_NODE_ID:
+            break
+        if synced:
+            end = (index + 1) * FRAME_BYTES
+    return end
 
 
 def _frame_difference(tick: int, where: str, logged: bytes, replayed: bytes) -> Difference:

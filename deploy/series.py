@@ -12,8 +12,16 @@ from deploy.errors import ReportError
 from schemas.base import ControlMode
 from schemas.load import Run
 from schemas.log import LogReader
-from schemas.messages import ControllerTrace, CycleStatistics, Event, JointCommand, PlantTruth, RobotState
-from schemas.topics import decode
+from schemas.messages import (
+    BusStatistics,
+    ControllerTrace,
+    CycleStatistics,
+    Event,
+    JointCommand,
+    PlantTruth,
+    RobotState,
+)
+from schemas.topics import LOAD_PREFIX, decode
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -79,6 +87,8 @@ class RunSeries:
     truth: TruthSeries
     events: tuple[Event, ...]
     statistics: tuple[CycleStatistics, ...]
+    bus_statistics: tuple[BusStatistics, ...] = ()
+    """Of all buses, in the order of writing."""
 
 
 def read_series(path: Path) -> RunSeries:
@@ -96,7 +106,9 @@ def read_series(path: Path) -> RunSeries:
     truths: list[PlantTruth] = []
     events: list[Event] = []
     statistics: list[CycleStatistics] = []
-    for record in reader.records(("state", "command", "trace", "truth", "event", "health")):
+    bus_statistics: list[BusStatistics] = []
+    loads = [LOAD_PREFIX + bus.name for bus in reader.run.robot.description.buses]
+    for record in reader.records(("state", "command", "trace", "truth", "event", "health", *loads)):
         match record.topic:
             case "state":
                 states.append(decode(RobotState, record.data))
@@ -108,8 +120,10 @@ def read_series(path: Path) -> RunSeries:
                 truths.append(decode(PlantTruth, record.data))
             case "event":
                 events.append(decode(Event, record.data))
-            case _:
+            case "health":
                 statistics.append(decode(CycleStatistics, record.data))
+            case _:
+                bus_statistics.append(decode(BusStatistics, record.data))
     if not states:
         raise ReportError(f"{path}: the log holds no state; did the HAL start?")
     n = len(reader.run.robot.description.joints)
@@ -122,6 +136,7 @@ def read_series(path: Path) -> RunSeries:
         truth=truth_series(truths, n, reader.run.robot.description.hand_frame),
         events=tuple(events),
         statistics=tuple(statistics),
+        bus_statistics=tuple(bus_statistics),
     )
 
 

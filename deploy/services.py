@@ -53,8 +53,13 @@ def run_service(service: Service, run: Run, options: ServiceOptions, *, debug: b
     except CosimError as error:
         if debug:
             traceback.print_exc()
-        print(f"{service}: {error}", file=sys.stderr, flush=True)
+        print(said_by(service, str(error)), file=sys.stderr, flush=True)
         return error.exit_code
+
+
+def said_by(service: Service, words: str) -> str:
+    """Put the speaker's name before words that do not begin with it."""
+    return words if words.startswith(f"{service}: ") else f"{service}: {words}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from deploy.metrics import CSP, CST, RunMetrics
 
 MODE_NAMES = {CSP: "position", CST: "torque"}
 
 
-def summary_table(metrics: RunMetrics) -> Table:
-    """Two columns: what, how much."""
+def summary_table(metrics: RunMetrics) -> RenderableType:
+    """Two columns, what and how much; below them a line for each bus that lost frames."""
     table = Table(
         title=f"{metrics.scenario} on {metrics.robot}, {metrics.clock}, seed {metrics.seed}", show_header=False
     )
@@ -31,7 +33,13 @@ def summary_table(metrics: RunMetrics) -> Table:
     for change in metrics.mode_changes:
         names = " → ".join(MODE_NAMES.get(mode, f"mode {mode}") for mode in (change.from_mode, change.to_mode))
         table.add_row(f"torque step {names} at {change.time_s:.3f} s", f"{change.largest_step:.2%} of the limit")
+    for bus in metrics.buses:
+        table.add_row(f"load of {bus.bus}, mean / busiest cycle", f"{bus.load_mean:.1%} / {bus.load_max:.1%}")
     table.add_row("warnings / errors", f"{metrics.warnings} / {metrics.errors}")
     if not metrics.log_complete:
         table.add_row("log", "cut short: the recorder was killed")
-    return table
+    losses = [line for bus in metrics.buses if (line := bus.complaint())]
+    if losses:
+        why = ", though the buses can carry this plan" if metrics.plan_fits else ": the buses cannot carry this plan"
+        losses.append(f"late commands act a cycle or more later, replaced frames never{why}; see `cosim doctor --log`")
+    return Group(table, *(Text(line, style="yellow") for line in losses))

@@ -147,6 +147,7 @@ def service_environment(run_directory: Path) -> dict[str, str]:
     environment.update(dict.fromkeys(ONE_THREAD, "1"))
     environment["PYTHONUNBUFFERED"] = "1"
     environment["COSIM_RUN_DIR"] = str(run_directory)
+    environment.setdefault("MUJOCO_GL", "disable")  # no service draws, and looking for a display takes time
     return environment
 
 

@@ -1,35 +1,44 @@
-"""The network boot: from powered drives to OPERATION ENABLED in position mode, holding where they stand.
+"""The network boot: from drives that were found to OPERATION ENABLED in position mode, holding where they stand.
 
-Everything is set by NMT and SDO, no SYNC is sent, so that no simulated time passes. The frames depend on the robot
-description and the drives' answers alone.
+Everything is set by NMT and SDO. No SYNC is sent to the profile's own drives, so that no simulated time passes, and the
+frames depend on the robot description and the drives' answers alone.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hal.boot_objects import SdoWrite, communication_writes, drive_writes, pdo_writes
+from hal.boot_objects import (
+    HEARTBEAT_TOLERANCE,
+    Need,
+    SdoWrite,
+    communication_writes,
+    drive_writes,
+    is_foreign,
+    pdo_plans,
+)
 from hal.bus.ports import FramePort
-from hal.errors import BootError
-from hal.node_link import NodeLink, PortNetwork
+from hal.enable import PowerUp
+from hal.errors import BootError, HalError
+from hal.find import FoundNodes, disable, find_nodes, for_all
+from hal.node_link import SYNC_WINDOW_US, NodeLink
+from hal.pdo_setup import set_up_pdo
 from hal.profile import identifiers, objects
-from hal.profile.cia402 import SUPPORTED_MODES, Controlword, OperationMode, decode_state, next_controlword
+from hal.profile.cia402 import OperationMode
 from hal.profile.frames import pack
 from hal.profile.sensors import force_torque_command
 from hal.profile.units import DriveUnits
 from schemas.base import Vector
-from schemas.messages import DriveState
 from schemas.robot import Joint, RobotDescription
 
 POSITION_MARGIN_RAD = 0.05
 """How far beyond its range a joint may stand at the boot."""
-POLL_S = 0.001
-"""Pause before a drive that is on its way is asked again."""
+HEARTBEAT_WAIT_S = 2.0
+"""Wait for the first heartbeat of another maker's drive, at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +57,8 @@ class DriveReport:
     """Object 0x6064."""
     position: float
     """The same at the joint [rad]."""
+    notes: tuple[str, ...] = ()
+    """What the drive did not take but can do without, e.g. that it cannot watch the HAL's heartbeat."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,102 +77,140 @@ class BootReport:
         """Where the drives stood [counts]."""
         return tuple(drive.position_counts for drive in self.drives)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All drives' notes."""
+        return tuple(note for drive in self.drives for note in drive.notes)
 
-def boot_network(robot: RobotDescription, ports: Sequence[FramePort], timeout_s: float = 5.0) -> BootReport:
-    """Boot every drive of a robot and start its sensors.
+
+def boot_network(
+    robot: RobotDescription, ports: Sequence[FramePort], timeout_s: float = 5.0, found: FoundNodes | None = None
+) -> BootReport:
+    """Boot every drive of a robot and start its sensors; whatever fails, all drives are left disabled.
 
     Args:
         robot: the description; `ports` follow its buses.
         ports: one open port a bus.
         timeout_s: time [s] for all nodes to appear, and again for each drive to be enabled.
+        found: what `find_nodes` found on these ports; None: it is asked first.
 
     Raises:
-        BootError: nodes are missing (all are named), a drive is another than described, refuses a parameter, stands
-            outside its joint's range, or does not reach OPERATION ENABLED.
+        BootError: nodes are missing or others than described (all are named), refuse a parameter, stand outside their
+            joint's range, send no heartbeat, or do not reach OPERATION ENABLED.
         BusLostError: a bus is gone.
 
     """
-    if len(ports) != len(robot.buses):
-        raise BootError(f"robot {robot.name} has {len(robot.buses)} buses, {len(ports)} ports are open")
-    networks = [PortNetwork(port) for port in ports]
-    links = [
-        NodeLink(networks[robot.bus_index(joint.drive.bus)], joint.drive.node_id, joint.name) for joint in robot.joints
-    ]
-    _reset(networks, links, timeout_s)
-    identities = [_identify(link, joint) for link, joint in zip(links, robot.joints, strict=True)]
-    for link, joint in zip(links, robot.joints, strict=True):
-        _write_all(link, communication_writes(robot, joint.drive))
-        _write_all(link, pdo_writes(joint.drive))
-        _write_all(link, drive_writes(robot, joint))
-    counts = np.array([link.read(objects.POSITION_ACTUAL) for link in links], dtype=np.int32)
-    positions = DriveUnits.of(robot).position_from_counts(counts)
-    for link, joint, position in zip(links, robot.joints, positions.tolist(), strict=True):
-        _check_position(link, joint, position)
-    for link, joint, stand in zip(links, robot.joints, counts.tolist(), strict=True):
-        _prepare(link, joint, stand)
-    for link in links:
-        link.command(identifiers.NMT_START)
+    if found is None:
+        found = find_nodes(robot, ports, timeout_s)
+    links = found.links
+    climbs: list[PowerUp] = []
     try:
-        modes = [_enable(link, timeout_s) for link in links]
-    except BootError:
-        _disable(links)
+        _rejoin(found)
+        notes = for_all(links, lambda index, link: _configure(robot, link, robot.joints[index]))
+        counts = for_all(links, lambda _, link: link.read(objects.POSITION_ACTUAL))
+        positions = _positions(robot, counts)
+        for_all(links, lambda index, link: _check_position(link, robot.joints[index], positions[index]))
+        _check_restarts(found)
+        _await_heartbeats(robot, links)
+        _check_restarts(found)
+        climbs += _climbs(robot, links, counts, timeout_s)
+        for_all(links, lambda index, _: climbs[index].prepare())
+        for link in links:
+            link.command(identifiers.NMT_START)
+        modes = [climb.run() for climb in climbs]
+        _check_restarts(found)
+    except HalError:  # a bus that went down included
+        for climb in climbs:
+            climb.give_up()
+        disable(links)
         raise
     for sensor in robot.force_torque_sensors:
         ports[robot.bus_index(sensor.bus)].send(pack(sensor.command_id, force_torque_command(start=True)))
+    stands = [climb.counts for climb in climbs]
     return BootReport(
         tuple(
-            DriveReport(link.joint, link.node_id, *identity, mode, stand, position)
-            for link, identity, mode, stand, position in zip(
-                links, identities, modes, counts.tolist(), positions.tolist(), strict=True
+            DriveReport(
+                joint=link.joint,
+                node_id=link.node_id,
+                vendor_id=identity.vendor_id,
+                product_code=identity.product_code,
+                supported_modes=identity.supported_modes,
+                mode=mode,
+                position_counts=stand,
+                position=position,
+                notes=note,
+            )
+            for link, identity, mode, stand, position, note in zip(
+                links, found.identities, modes, stands, _positions(robot, stands), notes, strict=True
             )
         )
     )
 
 
-def _reset(networks: Iterable[PortNetwork], links: Sequence[NodeLink], timeout_s: float) -> None:
-    """Reset the communication of all nodes and wait for their boot-up messages."""
-    for network in networks:
-        network.pump(0.0)
-    for link in links:
-        link.booted = False
-        link.command(identifiers.NMT_RESET_COMMUNICATION)
-    deadline = time.monotonic() + timeout_s
-    for link in links:
-        link.network.wait_until(lambda link=link: link.booted, deadline - time.monotonic())  # type: ignore[misc]
-    missing = [link.where for link in links if not link.booted]
-    if missing:
-        raise BootError(
-            f"{len(missing)} of {len(links)} drives did not boot within {timeout_s:g} s: {', '.join(missing)};"
-            " check power, node ids and wiring"
-        )
-    for link in links:
-        link.command(identifiers.NMT_PRE_OPERATIONAL)
+def _positions(robot: RobotDescription, counts: list[int]) -> list[float]:
+    positions: list[float] = DriveUnits.of(robot).position_from_counts(np.array(counts, dtype=np.int32)).tolist()
+    return positions
 
 
-def _identify(link: NodeLink, joint: Joint) -> tuple[int, int, int]:
-    """Vendor, product and modes of a drive, once they are known to be those described."""
-    vendor_id, product_code = link.read(objects.IDENTITY, 1), link.read(objects.IDENTITY, 2)
-    for name, found, expected in (
-        ("vendor_id", vendor_id, joint.drive.vendor_id),
-        ("product_code", product_code, joint.drive.product_code),
+def _rejoin(found: FoundNodes) -> None:
+    """Stop again what restarted since it was found: such a node may have gone to OPERATIONAL by itself."""
+    for index, link in enumerate(found.links):
+        link.network.pump(0.0)
+        if link.boot_ups > found.boot_ups[index]:
+            link.command(identifiers.NMT_PRE_OPERATIONAL)
+        link.boot_ups = found.boot_ups[index]
+
+
+def _check_restarts(found: FoundNodes) -> None:
+    for link, boot_ups in zip(found.links, found.boot_ups, strict=True):
+        if link.boot_ups > boot_ups:
+            raise BootError(f"{link.where}: was reset during the boot; check its supply, or for another NMT master")
+
+
+def _configure(robot: RobotDescription, link: NodeLink, joint: Joint) -> tuple[str, ...]:
+    """Write all parameters of one drive; what it did not take but can do without."""
+    notes: list[str] = []
+    absent: list[str] = []
+    reports_errors = True
+    if is_foreign(joint.drive):
+        _settle(link, absent, notes)
+        link.read(objects.TORQUE_ACTUAL)  # mapped, so it must be there, with the profile's length
+        reports_errors = link.read_optional(objects.ERROR_CODE) is not None
+        absent += [] if reports_errors else [f"0x{objects.ERROR_CODE:04X}:0"]
+    link.heartbeats = 0
+    for write in communication_writes(robot, joint.drive):
+        _write(link, write, absent, notes)
+    for plan in pdo_plans(joint.drive, reports_errors=reports_errors):
+        note = set_up_pdo(link, plan)
+        notes += [] if note is None else [note]
+    for write in drive_writes(robot, joint):
+        _write(link, write, absent, notes)
+    if absent:
+        notes.insert(0, f"{link.where}: the drive works without optional objects: {', '.join(absent)}")
+    return tuple(notes)
+
+
+def _write(link: NodeLink, write: SdoWrite, absent: list[str], notes: list[str]) -> None:
+    refusal = link.try_write(write.index, write.subindex, write.value)
+    if refusal is None:
+        return
+    if refusal.absent and write.need is not Need.ALWAYS:
+        absent.append(f"0x{write.index:04X}:{write.subindex}")
+    elif write.need is Need.WISH:
+        notes.append(refusal.text)
+    else:
+        raise BootError(refusal.text)
+
+
+def _settle(link: NodeLink, absent: list[str], notes: list[str]) -> None:
+    """Have a drive take the HAL's SYNC, commands at any time before it, and send EMCY where the HAL listens."""
+    for index, value, need in (
+        (objects.SYNC_COB_ID, identifiers.SYNC, Need.ALWAYS),
+        (SYNC_WINDOW_US, 0, Need.WISH),
+        (objects.EMCY_COB_ID, identifiers.EMCY + link.node_id, Need.WISH),
     ):
-        if found != expected:
-            raise BootError(
-                f"{link.where}: {name} is 0x{found:08X}, the robot description says 0x{expected:08X};"
-                " wrong drive, or correct the description"
-            )
-    supported, needed = link.read(objects.SUPPORTED_DRIVE_MODES), SUPPORTED_MODES[joint.drive.kind]
-    if supported & needed != needed:
-        raise BootError(
-            f"{link.where}: object 0x6502 is 0x{supported:08X}, a {joint.drive.kind} drive needs 0x{needed:08X}"
-            " (bit n-1 for mode n)"
-        )
-    return vendor_id, product_code, supported
-
-
-def _write_all(link: NodeLink, writes: Iterable[SdoWrite]) -> None:
-    for write in writes:
-        link.write(write.index, write.subindex, write.value, optional=write.optional)
+        if link.read_optional(index) not in (None, value):
+            _write(link, SdoWrite(index, 0, value, need), absent, notes)
 
 
 def _check_position(link: NodeLink, joint: Joint, position: float) -> None:
@@ -173,46 +222,26 @@ def _check_position(link: NodeLink, joint: Joint, position: float) -> None:
         )
 
 
-def _prepare(link: NodeLink, joint: Joint, counts: int) -> None:
-    """Set position mode and, unless the drive holds already, targets that keep the joint where it stands."""
-    link.write(objects.MODE, 0, OperationMode.CSP)
-    if decode_state(link.read(objects.STATUSWORD)) is not DriveState.OPERATION_ENABLED:
-        link.write(objects.TARGET_POSITION, 0, counts)
-        if joint.drive.kind == "torque":
-            link.write(objects.TARGET_TORQUE, 0, 0)
+def _await_heartbeats(robot: RobotDescription, links: Sequence[NodeLink]) -> None:
+    """Hear a heartbeat of every drive of another maker; the profile's own beat in simulated time."""
+    wait_s = max(HEARTBEAT_WAIT_S, HEARTBEAT_TOLERANCE * robot.safety.heartbeat_s)
+    deadline = time.monotonic() + wait_s
 
-
-def _disable(links: Iterable[NodeLink]) -> None:
-    """Take the power from all drives after a boot that failed: nobody will watch them, and their brakes hold."""
-    for link in links:
-        with suppress(BootError):  # the failure that led here is the one to tell of
-            link.write(objects.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
-
-
-def _enable(link: NodeLink, timeout_s: float) -> OperationMode:
-    """Lead a drive to OPERATION ENABLED, reading a fresh statusword before each step; its mode then."""
-    deadline = time.monotonic() + timeout_s
-    before: DriveState | None = None
-    fault_was_reset = False
-    while True:
-        state = decode_state(link.read(objects.STATUSWORD))
-        if state is DriveState.OPERATION_ENABLED:
-            break
-        if time.monotonic() > deadline or (state is DriveState.FAULT and fault_was_reset):
-            code = link.read_optional(objects.ERROR_CODE) or 0
+    def check(index: int, link: NodeLink) -> None:
+        if not is_foreign(robot.joints[index].drive):
+            return
+        if not link.network.wait_until(lambda: link.heartbeats > 0, deadline - time.monotonic()):
             raise BootError(
-                f"{link.where}: stays in {state.name} instead of OPERATION_ENABLED, error code 0x{code:04X};"
-                " remove the cause and start again"
+                f"{link.where}: no heartbeat within {wait_s:g} s although object 0x1017 asks for one every"
+                f" {robot.safety.heartbeat_s * 1e3:g} ms; wrong drive, or check its firmware"
             )
-        command = next_controlword(state, DriveState.OPERATION_ENABLED)
-        if command == Controlword.FAULT_RESET:
-            fault_was_reset = True
-            link.write(objects.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
-        elif state is before:
-            time.sleep(POLL_S)
-        before = state
-        link.write(objects.CONTROLWORD, 0, command)
-    mode = link.read(objects.MODE_DISPLAY)
-    if mode != OperationMode.CSP:
-        raise BootError(f"{link.where}: reports mode {mode} (object 0x6061) after mode {OperationMode.CSP:d} was set")
-    return OperationMode.CSP
+
+    for_all(links, check)
+
+
+def _climbs(robot: RobotDescription, links: Sequence[NodeLink], counts: list[int], timeout_s: float) -> list[PowerUp]:
+    own_buses = {joint.drive.bus for joint in robot.joints if not is_foreign(joint.drive)}
+    return [
+        PowerUp(link, joint, stand, timeout_s, robot.period_s, may_sync=joint.drive.bus not in own_buses)
+        for link, joint, stand in zip(links, robot.joints, counts, strict=True)
+    ]

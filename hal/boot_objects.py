@@ -1,12 +1,15 @@
-"""What the boot writes to a drive: pure lists of SDO writes, from the robot description and the profile's PDOs."""
+"""What the boot sets in a drive: pure lists of values, from the robot description and the profile's PDOs."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import Enum
+from typing import Final
 
 from hal.profile import identifiers, objects
 from hal.profile.cia402 import AbortConnectionOption
+from hal.profile.objects import Pdo, TransmissionType
 from schemas.robot import Drive, Joint, RobotDescription
 
 PROFILE_VENDOR_ID = 0x00000402
@@ -17,16 +20,59 @@ PDO_RECORDS = 2
 """PDO records of each direction that the profile uses."""
 FOREIGN_PDO_RECORDS = 4
 """PDO records that CiA 402 drives of other makers preset: the unused ones are made invalid."""
+FOREIGN_RPDO_TYPES: Final = (TransmissionType.EVERY_SYNC, 0, TransmissionType.EVENT_DRIVEN, 254)
+FOREIGN_MODE_TYPES: Final = (TransmissionType.EVERY_SYNC, TransmissionType.SYNC_ON_CHANGE, 255, 254)
+"""Another maker's drive reports mode and error after every SYNC where it can: stacks differ in what is a change."""
+
+
+TPDO_MODE_ALONE: Final = Pdo(
+    objects.TPDO_MODE.number, objects.TPDO_MODE.cob_base, objects.TPDO_MODE.entries[:1], TransmissionType.EVERY_SYNC
+)
+"""TPDO2 of a drive that has no error code 0x603F: 1 byte."""
+
+
+class Need(Enum):
+    """What becomes of a drive that does not take a value."""
+
+    ALWAYS = "always"
+    """It is refused."""
+    IF_PRESENT = "if present"
+    """It is refused, unless it has no such object at all."""
+    WISH = "wish"
+    """It is used all the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class SdoWrite:
-    """One write; an optional one may fail because the device has no such object."""
+    """One value for one object."""
 
     index: int
     subindex: int
     value: int
-    optional: bool = False
+    need: Need = Need.ALWAYS
+
+
+@dataclass(frozen=True, slots=True)
+class PdoPlan:
+    """One PDO record of a drive and what it has to hold."""
+
+    name: str
+    """E.g. `TPDO1`, in the standard's counting."""
+    communication: int
+    """Index of its communication record."""
+    mapping: int
+    """Index of its mapping record."""
+    pdo: Pdo | None
+    """None: the PDO is not used, and made invalid where it exists."""
+    cob_id: int = 0
+    """Entry of sub-index 1 that makes it valid."""
+    types: tuple[int, ...] = ()
+    """Transmission types that do, the best first."""
+
+
+def is_foreign(drive: Drive) -> bool:
+    """Whether a drive is another maker's: it has the objects of the standards alone, and not all of them."""
+    return drive.vendor_id != PROFILE_VENDOR_ID
 
 
 def communication_writes(description: RobotDescription, drive: Drive) -> tuple[SdoWrite, ...]:
@@ -34,13 +80,14 @@ def communication_writes(description: RobotDescription, drive: Drive) -> tuple[S
     heartbeat_ms = max(1, round(description.safety.heartbeat_s * 1000.0))
     consumer = identifiers.HAL_NODE_ID << 16 | HEARTBEAT_TOLERANCE * heartbeat_ms
     mantissa, exponent = interpolation_period(description.period_s)
-    foreign = drive.vendor_id != PROFILE_VENDOR_ID
+    foreign = is_foreign(drive)
+    if_present, wish = (Need.IF_PRESENT, Need.WISH) if foreign else (Need.ALWAYS, Need.ALWAYS)
     return (
         SdoWrite(objects.PRODUCER_HEARTBEAT_MS, 0, heartbeat_ms),
-        SdoWrite(objects.CONSUMER_HEARTBEAT, 1, consumer),
-        SdoWrite(objects.SYNC_PERIOD_US, 0, round(description.period_s * 1e6), foreign),
-        SdoWrite(objects.INTERPOLATION_PERIOD, 1, mantissa, foreign),
-        SdoWrite(objects.INTERPOLATION_PERIOD, 2, exponent, foreign),
+        SdoWrite(objects.CONSUMER_HEARTBEAT, 1, consumer, if_present),
+        SdoWrite(objects.SYNC_PERIOD_US, 0, round(description.period_s * 1e6), wish),
+        SdoWrite(objects.INTERPOLATION_PERIOD, 1, mantissa, if_present),
+        SdoWrite(objects.INTERPOLATION_PERIOD, 2, exponent, if_present),
     )
 
 
@@ -51,15 +98,17 @@ def drive_writes(description: RobotDescription, joint: Joint) -> tuple[SdoWrite,
     instead, by which it stops when the HAL's heartbeat is missing.
     """
     drive, safety = joint.drive, description.safety
-    per_mille = math.floor(1000.0 * joint.torque_limit / (drive.rated_motor_torque * joint.gear_ratio) * (1.0 + 1e-12))
-    torque = (
-        SdoWrite(objects.RATED_TORQUE_MNM, 0, round(drive.rated_motor_torque * 1000.0)),
-        SdoWrite(objects.MAX_TORQUE, 0, per_mille),
-    )
-    if drive.vendor_id != PROFILE_VENDOR_ID:
-        return (*torque, SdoWrite(objects.ABORT_CONNECTION_OPTION, 0, AbortConnectionOption.QUICK_STOP, optional=True))
+    rated, limit = round(drive.rated_motor_torque * 1000.0), torque_limit_per_mille(joint)
+    if is_foreign(drive):
+        need = Need.ALWAYS if drive.kind == "servo" else Need.IF_PRESENT
+        return (
+            SdoWrite(objects.RATED_TORQUE_MNM, 0, rated, Need.IF_PRESENT),
+            SdoWrite(objects.MAX_TORQUE, 0, limit, need),
+            SdoWrite(objects.ABORT_CONNECTION_OPTION, 0, AbortConnectionOption.QUICK_STOP, Need.WISH),
+        )
     return (
-        *torque,
+        SdoWrite(objects.RATED_TORQUE_MNM, 0, rated),
+        SdoWrite(objects.MAX_TORQUE, 0, limit),
         SdoWrite(objects.POSITION_GAIN, 0, round(drive.position_gain * 1000.0)),
         SdoWrite(objects.VELOCITY_GAIN, 0, round(drive.velocity_gain * 1000.0)),
         SdoWrite(objects.JOINT_TORQUE_LIMIT, 0, round(joint.torque_limit * 1000.0)),
@@ -68,29 +117,38 @@ def drive_writes(description: RobotDescription, joint: Joint) -> tuple[SdoWrite,
     )
 
 
-def pdo_writes(drive: Drive) -> tuple[SdoWrite, ...]:
-    """Map the PDOs of a drive's kind and make all others invalid."""
+def torque_limit_per_mille(joint: Joint) -> int:
+    """Object 0x6072: the joint's torque limit in ‰ of the rated torque, rounded down."""
+    rated = joint.drive.rated_motor_torque * joint.gear_ratio
+    return math.floor(1000.0 * joint.torque_limit / rated * (1.0 + 1e-12))
+
+
+def pdo_plans(drive: Drive, *, reports_errors: bool = True) -> tuple[PdoPlan, ...]:
+    """List the PDO records of a drive: those of its kind, and all others invalid.
+
+    Args:
+        drive: as described.
+        reports_errors: it has object 0x603F.
+    """
+    foreign, node = is_foreign(drive), drive.node_id
     rpdos = {pdo.number: pdo for pdo in objects.RPDOS[drive.kind]}
-    tpdos = {pdo.number: pdo for pdo in objects.TPDOS}
-    node = drive.node_id
-    foreign = drive.vendor_id != PROFILE_VENDOR_ID
-    writes: list[SdoWrite] = []
+    tpdos = {pdo.number: pdo for pdo in (objects.TPDO_STATE, objects.TPDO_MODE if reports_errors else TPDO_MODE_ALONE)}
+    plans: list[PdoPlan] = []
     for number in range(FOREIGN_PDO_RECORDS if foreign else PDO_RECORDS):
-        step = 0x100 * number
-        if number in tpdos:
-            communication = objects.TPDO_COMMUNICATION + number
-            cob_id = identifiers.COB_ID_NO_RTR | tpdos[number].cob_id(node)
-            writes += _remap(communication, objects.TPDO_MAPPING + number, tpdos[number], cob_id)
-        else:
-            cob_id = identifiers.COB_ID_NO_RTR | identifiers.TPDO1 + step + node
-            writes.append(_invalidate(objects.TPDO_COMMUNICATION + number, cob_id, number >= PDO_RECORDS))
-        if number in rpdos:
-            communication = objects.RPDO_COMMUNICATION + number
-            writes += _remap(communication, objects.RPDO_MAPPING + number, rpdos[number], rpdos[number].cob_id(node))
-        else:
-            cob_id = identifiers.RPDO1 + step + node
-            writes.append(_invalidate(objects.RPDO_COMMUNICATION + number, cob_id, number >= PDO_RECORDS))
-    return tuple(writes)
+        tpdo, rpdo = tpdos.get(number), rpdos.get(number)
+        cob_id = 0
+        types: tuple[int, ...] = ()
+        if tpdo is not None:
+            cob_id = identifiers.COB_ID_NO_RTR | tpdo.cob_id(node)
+            types = FOREIGN_MODE_TYPES if foreign and tpdo is not objects.TPDO_STATE else (tpdo.transmission_type,)
+        records = (objects.TPDO_COMMUNICATION + number, objects.TPDO_MAPPING + number)
+        plans.append(PdoPlan(f"TPDO{number + 1}", *records, tpdo, cob_id, types))
+        cob_id, types = 0, ()
+        if rpdo is not None:
+            cob_id, types = rpdo.cob_id(node), FOREIGN_RPDO_TYPES if foreign else (rpdo.transmission_type,)
+        records = (objects.RPDO_COMMUNICATION + number, objects.RPDO_MAPPING + number)
+        plans.append(PdoPlan(f"RPDO{number + 1}", *records, rpdo, cob_id, types))
+    return tuple(plans)
 
 
 def interpolation_period(period_s: float) -> tuple[int, int]:
@@ -103,20 +161,3 @@ def interpolation_period(period_s: float) -> tuple[int, int]:
         mantissa //= 10
         exponent += 1
     return mantissa, exponent
-
-
-def _remap(communication: int, mapping: int, pdo: objects.Pdo, cob_id: int) -> list[SdoWrite]:
-    """Follow the sequence of CiA 301 section 7.5.2.36: invalid, empty, entries, count, type, valid."""
-    entries = [SdoWrite(mapping, number, entry) for number, entry in enumerate(pdo.entries, 1)]
-    return [
-        _invalidate(communication, cob_id),
-        SdoWrite(mapping, 0, 0),
-        *entries,
-        SdoWrite(mapping, 0, len(entries)),
-        SdoWrite(communication, 2, pdo.transmission_type),
-        SdoWrite(communication, 1, cob_id),
-    ]
-
-
-def _invalidate(communication: int, cob_id: int, optional: bool = False) -> SdoWrite:
-    return SdoWrite(communication, 1, identifiers.COB_ID_INVALID | cob_id, optional)

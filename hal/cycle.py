@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, Literal
 
 import numpy as np
 
+from hal.bus_trouble import BusTrouble
 from hal.commands import CommandCheck
 from hal.compose import Composer, released
 from hal.decode import Decoder, Measured, Notice
@@ -26,6 +27,8 @@ from schemas.messages import DriveState, Event, HalStatus, JointCommand, RobotSt
 from schemas.robot import RobotDescription
 
 Severity = Literal["info", "warning", "error"]
+_ExpectedKey = tuple[bool, frozenset[int], frozenset[str], frozenset[int]]
+"""Mode change; silent joints, sensors and buses."""
 
 SETTLE_S: Final = 0.1
 """Time that the HAL stays beyond the hold's ramp."""
@@ -74,7 +77,10 @@ class HalCore:
         self._safe_stop = False
         self._emergency_stop = False
         self._holding = False
-        self._expected: dict[tuple[bool, frozenset[int], frozenset[str]], tuple[frozenset[int], ...]] = {}
+        self._expected: dict[_ExpectedKey, tuple[frozenset[int], ...]] = {}
+        self._trouble = BusTrouble(robot)
+        self._reset_joints: set[int] = set()
+        """Joints whose drives were reset in operation: what the boot has set is gone, so they are not enabled."""
         self._modes: tuple[ControlMode, ...] = (ControlMode.POSITION,) * len(robot.joints)
         self._states: tuple[DriveState, ...] = (DriveState.OPERATION_ENABLED,) * len(robot.joints)
         self._errors: tuple[int, ...] = (0,) * len(robot.joints)
@@ -119,12 +125,24 @@ class HalCore:
     def expected_reports(self) -> tuple[frozenset[int], ...]:
         """Identifiers per bus to await after the SYNC that latches what `apply` sent last; ask before `decode`."""
         change = operation_mode(self._sent.mode) is not operation_mode(self._latched.mode)
-        key = (change, self._supervisor.silent_joints, self._supervisor.silent_sensors)
+        silent = self._trouble.silent_buses
+        key = (change, self._supervisor.silent_joints, self._supervisor.silent_sensors, silent)
         if key not in self._expected:
-            self._expected[key] = expected_reports(
-                self.robot, mode_change=change, silent_joints=key[1], silent_sensors=key[2]
+            expected = expected_reports(self.robot, mode_change=change, silent_joints=key[1], silent_sensors=key[2])
+            self._expected[key] = tuple(
+                frozenset() if index in silent else identifiers for index, identifiers in enumerate(expected)
             )
         return self._expected[key]
+
+    @property
+    def troubled_buses(self) -> tuple[str, ...]:
+        """Names of the buses in trouble, and of those whose drives have not yet been found to hold after one."""
+        return self._trouble.buses
+
+    def set_bus_down(self, index: int, reason: str | None) -> None:
+        """Say that a bus takes and gives no frames now, and why, or that it does again; the next `apply` acts on it."""
+        self._trouble.set_down(index, reason)
+        self._supervisor.excuse(self._trouble.joints)
 
     def decode(self, sequence: int, frames_per_bus: Sequence[bytes]) -> RobotState:
         """Read the reports of SYNC `sequence`, frames of each bus in the order of the robot's buses.
@@ -142,6 +160,7 @@ class HalCore:
         self._review(measured)
         self._update_tuples(measured)
         torque = vector(measured.motor_torque) if self._reports_torque else None
+        self._reset_joints |= measured.reset
         return RobotState(
             sequence=sequence,
             time_ns=sequence * self.robot.period_ns,
@@ -172,12 +191,16 @@ class HalCore:
         measured = self._measured
         if measured is None:
             raise HalError("apply before the first decode; every cycle decodes its reports first")
+        if measured.errors or self._trouble.active:
+            self._act_on(self._trouble.review(measured, self._supervisor.enabled), measured)
+            self._supervisor.excuse(self._trouble.joints)
         arrays = None if command is None else self._checked(command)
         if self.status is HalStatus.ACTIVE:
             self._count(arrays is not None)
         active = self.status is HalStatus.ACTIVE
         self._sent = self._follow(command, arrays, measured) if active else self._hold(measured)
-        return self._drivers.encode(self._sent, self._controlwords(measured))
+        packets = self._drivers.encode(self._sent, self._controlwords(measured))
+        return self._trouble.asking(packets) if self._trouble.active else packets
 
     def stop(self, reason: str, emergency: bool = False) -> None:
         """Stop from the next `apply` on; `emergency` latches until `reset`."""
@@ -271,9 +294,15 @@ class HalCore:
 
     def _review(self, measured: Measured) -> None:
         mode = operation_mode(self._latched.mode)
-        notices = self._supervisor.review(measured, mode, self._decoder.sensor_ages)
+        ages = self._decoder.sensor_ages
+        if self._trouble.active:
+            ages = self._trouble.expected_ages(ages)
+        notices = self._supervisor.review(measured, mode, ages)
         if self._latched.mode is ControlMode.TORQUE and self.status is HalStatus.ACTIVE:
             notices += self._guard.review(measured.position, self._predictor.mean_velocity)
+        self._act_on(notices, measured)
+
+    def _act_on(self, notices: Iterable[Notice], measured: Measured) -> None:
         for notice in notices:
             self._tell(notice.kind, notice.severity, notice.text, notice.joint)
             if notice.stops:
@@ -288,10 +317,12 @@ class HalCore:
         return DriveFaultError(self.robot.joint_names[joint], state, int(measured.error_code[joint]), notice.text)
 
     def _controlwords(self, measured: Measured) -> Controlwords:
-        if self._supervisor.all_enabled:
+        if self._supervisor.all_enabled and not self._reset_joints:
             return self._all_enabled
         keep = self._emergency_stop
         words = [controlword(DriveState(state), keep=keep) for state in measured.drive_state.tolist()]
+        for joint in self._reset_joints:
+            words[joint] = Controlword.DISABLE_VOLTAGE
         return np.array(words, dtype=np.uint16)
 
     def _update_tuples(self, measured: Measured) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -9,17 +10,28 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from hal.bus.error_frames import ErrorReport, decode_error
+from hal.emergency import emergency_text
 from hal.errors import HalError, ProfileError
 from hal.profile import identifiers, sensors
 from hal.profile.cia402 import STATE_BITS, STATE_TABLE, UNDEFINED, EmergencyCode, OperationMode
-from hal.profile.frames import FRAME_BYTES, view
-from hal.profile.objects import EMCY_STRUCT, MODE_STRUCT, STATE_LAYOUT, TPDO_MODE, TPDO_STATE
+from hal.profile.frames import CAN_ERR_FLAG, FRAME_BYTES, pack, view
+from hal.profile.objects import (
+    EMCY_STRUCT,
+    ERROR_CODE,
+    MODE_DISPLAY,
+    MODE_STRUCT,
+    STATE_LAYOUT,
+    TPDO_MODE,
+    TPDO_STATE,
+)
 from hal.profile.units import Array, DriveUnits
-from schemas.base import Quaternion, Vector3
+from hal.readings import ACCELERATION, FORCE, GYRO, QUATERNION, TORQUE, ForceTorqueReading, InertialReading
 from schemas.messages import DriveState, ImuSample, WrenchSample
-from schemas.robot import ForceTorqueSensor, Imu, RobotDescription
+from schemas.robot import RobotDescription
 
-_UNKNOWN, _STATE, _MODE, _EMCY, _HEARTBEAT, _FORCE, _TORQUE, _GYRO, _ACCELERATION, _QUATERNION = range(10)
+_UNKNOWN, _STATE, _MODE, _EMCY, _HEARTBEAT, _SDO = range(6)
+_FRAME_NAMES: Final = {_STATE: "TPDO1", _MODE: "TPDO2", _EMCY: "EMCY", _HEARTBEAT: "heartbeat", _SDO: "SDO answer"}
 _NO_ID: Final = 0x800
 """Row of all identifiers that are not 11-bit data frames."""
 _ANY_BUS: Final = _NO_ID + 1
@@ -27,6 +39,14 @@ _DATA: Final = 8
 """Where the data begin in a frame."""
 _PLANS: Final = 256
 """Plans kept; more orders of frames than this mean that none repeats."""
+_NOBODY: Final[frozenset[int]] = frozenset()
+_NONE_MALFORMED: Final[frozenset[tuple[int, int, int, int]]] = frozenset()
+_SDO_HEAD: Final = struct.Struct("<BHB")
+_ONE_BYTE, _TWO_BYTES = 0x4F, 0x4B
+"""Commands of an expedited upload's answer, CiA 301 section 7.2.4.3.6."""
+_UPLOAD: Final = 0x40
+MODE_ALONE_BYTES: Final = 1
+"""TPDO2 of a drive that has no error code, object 0x603F."""
 
 HARMLESS_EMERGENCIES: Final = frozenset(
     {
@@ -69,6 +89,14 @@ class Measured:
     wrenches: tuple[WrenchSample, ...]
     imus: tuple[ImuSample, ...]
     notices: tuple[Notice, ...]
+    heard: tuple[bool, ...]
+    """Buses on which frames of the wire came in this cycle."""
+    errors: tuple[tuple[int, ErrorReport], ...]
+    """Index of the bus and content of each error frame of its controller."""
+    answered: frozenset[int]
+    """Joints whose mode came by SDO in this cycle (see `mode_requests`)."""
+    reset: frozenset[int]
+    """Joints whose drives have announced their boot-up in this cycle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,65 +111,19 @@ class _Plan:
     """Every joint is among them."""
     others: tuple[tuple[int, int, int, int], ...]
     """Kind, index of joint or sensor, and the data's first and last byte of every other known frame."""
-
-
-class _ForceTorque:
-    """Last reading of one force/torque sensor and the frames of the running cycle."""
-
-    def __init__(self, sensor: ForceTorqueSensor) -> None:
-        self.sensor = sensor
-        self.parts: dict[int, bytes] = {}
-        self.age = 0
-        self._last: tuple[Vector3, Vector3] | None = None
-
-    def sample(self) -> WrenchSample | None:
-        self.age += 1
-        if len(self.parts) == 2:
-            sensor = self.sensor
-            self._last = sensors.decode_force_torque(
-                self.parts[_FORCE], self.parts[_TORQUE], sensor.force_resolution, sensor.torque_resolution
-            )
-            self.age = 0
-        self.parts.clear()
-        if self._last is None:
-            return None
-        force, torque = self._last
-        return WrenchSample(name=self.sensor.name, force_in_sensor=force, torque_in_sensor=torque, age_cycles=self.age)
-
-
-class _Inertial:
-    """Last reading of one inertial unit and the frames of the running cycle."""
-
-    def __init__(self, imu: Imu) -> None:
-        self.sensor = imu
-        self.parts: dict[int, bytes] = {}
-        self.age = 0
-        self._last: tuple[Vector3, Vector3, Quaternion] | None = None
-
-    def sample(self) -> ImuSample | None:
-        self.age += 1
-        if len(self.parts) == 3:
-            self._last = (
-                sensors.decode_gyro(self.parts[_GYRO]),
-                sensors.decode_acceleration(self.parts[_ACCELERATION]),
-                sensors.decode_quaternion(self.parts[_QUATERNION]),
-            )
-            self.age = 0
-        self.parts.clear()
-        if self._last is None:
-            return None
-        angular_velocity, acceleration, orientation = self._last
-        return ImuSample(
-            name=self.sensor.name,
-            angular_velocity_in_imu=angular_velocity,
-            acceleration_in_imu=acceleration,
-            orientation_imu_to_world=orientation,
-            age_cycles=self.age,
-        )
+    heard: tuple[bool, ...]
+    """Buses with frames of the wire."""
+    errors: tuple[tuple[int, int], ...]
+    """Bus and first byte of each error frame."""
+    malformed: frozenset[tuple[int, int, int, int]]
+    """Kind, index, length and expected length of frames of a known identifier with a wrong one."""
 
 
 class Decoder:
-    """Keeps what is reported on change between the cycles; unknown identifiers and wrong lengths change nothing."""
+    """Keeps what is reported on change between the cycles; unknown identifiers and wrong lengths change nothing.
+
+    Error frames of the controllers are handed out by themselves, remote and 29-bit frames are passed over.
+    """
 
     def __init__(self, robot: RobotDescription, positions: Array) -> None:
         """Start from drives in Operation Enabled, mode 8, at `positions` [rad] (as the boot leaves them).
@@ -164,9 +146,12 @@ class Decoder:
         self._error = np.zeros(count, dtype=np.uint16)
         self._none_silent = np.zeros(count, dtype=np.int64)
         self._silent = self._none_silent
-        self._force_torque = [_ForceTorque(sensor) for sensor in robot.force_torque_sensors]
-        self._inertial = [_Inertial(imu) for imu in robot.imus]
-        self._sensors: list[_ForceTorque | _Inertial] = [*self._force_torque, *self._inertial]
+        self._force_torque = [ForceTorqueReading(sensor) for sensor in robot.force_torque_sensors]
+        self._inertial = [InertialReading(imu) for imu in robot.imus]
+        self._sensors: list[ForceTorqueReading | InertialReading] = [*self._force_torque, *self._inertial]
+        self._malformed = _NONE_MALFORMED
+        self._answered: set[int] = set()
+        self._reset: set[int] = set()
         self._plans: dict[tuple[tuple[int, ...], bytes], _Plan] = {}
         self._bus_base = np.arange(len(robot.buses)) * _ANY_BUS
         self._kind = np.full(len(robot.buses) * _ANY_BUS, _UNKNOWN, dtype=np.uint8)
@@ -198,6 +183,15 @@ class Decoder:
             self._read_states(plan, notices)
         for kind, index, start, end in plan.others:
             self._read_other(kind, index, packet[start:end], notices)
+        if plan.malformed is not self._malformed:
+            notices += [self._wrong_length(*found) for found in sorted(plan.malformed - self._malformed)]
+            self._malformed = plan.malformed
+        errors = tuple((bus, decode_error(packet[start : start + FRAME_BYTES])) for bus, start in plan.errors)
+        answered, reset = _NOBODY, _NOBODY
+        if self._answered or self._reset:
+            answered, reset = frozenset(self._answered), frozenset(self._reset)
+            self._answered.clear()
+            self._reset.clear()
         wrenches = [unit.sample() for unit in self._force_torque]
         imus = [unit.sample() for unit in self._inertial]
         return Measured(
@@ -210,6 +204,10 @@ class Decoder:
             tuple(sample for sample in wrenches if sample is not None),
             tuple(sample for sample in imus if sample is not None),
             tuple(notices),
+            plan.heard,
+            errors,
+            answered,
+            reset,
         )
 
     def _plan(self, sizes: tuple[int, ...], packet: bytes, heads: npt.NDArray[np.uint64]) -> _Plan:
@@ -223,16 +221,32 @@ class Decoder:
         return plan
 
     def _sort(self, sizes: tuple[int, ...], frames: npt.NDArray[np.void]) -> _Plan:
-        base = np.repeat(self._bus_base, [size // FRAME_BYTES for size in sizes])
-        key = base + np.minimum(frames["can_id"], _NO_ID)
-        kind = np.where(frames["length"] == self._length[key], self._kind[key], _UNKNOWN)
+        counts = [size // FRAME_BYTES for size in sizes]
+        bus = np.repeat(np.arange(len(sizes)), counts)
+        key = self._bus_base[bus] + np.minimum(frames["can_id"], _NO_ID)
+        right = frames["length"] == self._length[key]
+        right |= (self._kind[key] == _MODE) & (frames["length"] == MODE_ALONE_BYTES)
+        kind = np.where(right, self._kind[key], _UNKNOWN)
+        is_error = frames["can_id"] & np.uint32(CAN_ERR_FLAG) != 0
+        errors = [(int(bus[row]), row * FRAME_BYTES) for row in np.flatnonzero(is_error).tolist()]
+        malformed = frozenset(
+            (
+                int(self._kind[key[row]]),
+                int(self._index[key[row]]),
+                int(frames["length"][row]),
+                int(self._length[key[row]]),
+            )
+            for row in np.flatnonzero(~right & (self._kind[key] != _UNKNOWN)).tolist()
+        )
+        heard = tuple(count > int(is_error[bus == index].sum()) for index, count in enumerate(counts))
         rows = np.flatnonzero(kind == _STATE)
         others = []
         for row in np.flatnonzero(kind > _STATE).tolist():
             start = row * FRAME_BYTES + _DATA
             others.append((int(kind[row]), int(self._index[key[row]]), start, start + int(frames["length"][row])))
         joints = self._index[key[rows]]
-        return _Plan(joints, 2 * rows + 1, len(np.unique(joints)) == len(self._joints), tuple(others))
+        complete = len(np.unique(joints)) == len(self._joints)
+        return _Plan(joints, 2 * rows + 1, complete, tuple(others), heard, tuple(errors), malformed or _NONE_MALFORMED)
 
     def _read_states(self, plan: _Plan, notices: list[Notice]) -> None:
         joints = plan.joints
@@ -257,31 +271,64 @@ class Decoder:
             notices.append(Notice("drive_fault", "error", text, joint, stops=True))
 
     def _read_other(self, kind: int, index: int, data: bytes, notices: list[Notice]) -> None:
-        if kind in (_FORCE, _TORQUE):
-            if kind == _TORQUE or data[0] == sensors.FORCE_TORQUE_START:
+        if kind in (FORCE, TORQUE):
+            if kind == TORQUE or data[0] == sensors.FORCE_TORQUE_START:
                 self._force_torque[index].parts[kind] = data
-        elif kind in (_GYRO, _ACCELERATION, _QUATERNION):
-            if kind != _QUATERNION or any(data):
+        elif kind in (GYRO, ACCELERATION, QUATERNION):
+            if kind != QUATERNION or any(data):
                 self._inertial[index].parts[kind] = data
         elif kind == _MODE:
-            self._mode, self._error = self._mode.copy(), self._error.copy()
-            self._mode[index], self._error[index] = MODE_STRUCT.unpack(data)
+            self._mode = self._mode.copy()
+            if len(data) == MODE_ALONE_BYTES:
+                self._mode[index] = int.from_bytes(data, "little", signed=True)
+            else:
+                self._error = self._error.copy()
+                self._mode[index], self._error[index] = MODE_STRUCT.unpack(data)
         elif kind == _EMCY:
             notices.append(self._emergency(index, data))
+        elif kind == _SDO:
+            self._read_answer(index, data)
         elif data[0] != identifiers.HEARTBEAT_OPERATIONAL:
+            if data[0] == identifiers.HEARTBEAT_BOOT_UP:
+                self._reset.add(index)
             what = (
                 "was reset" if data[0] == identifiers.HEARTBEAT_BOOT_UP else f"left OPERATIONAL (NMT state {data[0]})"
             )
             text = f"joint {self._joints[index]}: the drive {what} during operation; restart the HAL to boot it again"
             notices.append(Notice("node_lost", "error", text, index, stops=True))
 
+    def _read_answer(self, index: int, data: bytes) -> None:
+        """Take mode and error code from an expedited answer; all other answers are some tool's."""
+        command, object_index, subindex = _SDO_HEAD.unpack_from(data)
+        if (command, object_index, subindex) == (_ONE_BYTE, MODE_DISPLAY, 0):
+            self._mode = self._mode.copy()
+            self._mode[index] = int.from_bytes(data[4:5], "little", signed=True)
+            self._answered.add(index)
+        elif (command, object_index, subindex) == (_TWO_BYTES, ERROR_CODE, 0):
+            self._error = self._error.copy()
+            self._error[index] = int.from_bytes(data[4:6], "little")
+
+    def _wrong_length(self, kind: int, index: int, length: int, expected: int) -> Notice:
+        if kind in _FRAME_NAMES:
+            where, joint = f"joint {self._joints[index]}: {_FRAME_NAMES[kind]}", index
+        else:
+            units: list[ForceTorqueReading | InertialReading] = [
+                *(self._force_torque if kind < GYRO else self._inertial)
+            ]
+            where, joint = f"sensor {units[index].sensor.name}: a frame", None
+        text = f"{where} has {length} bytes, expected {expected}"
+        stops = kind in (_STATE, _MODE)
+        if stops:
+            text += "; is its PDO mapping the HAL's?"
+        return Notice("frame_length", "error" if stops else "warning", text, joint, stops=stops)
+
     def _emergency(self, index: int, data: bytes) -> Notice:
         code, register, extra = EMCY_STRUCT.unpack(data)
         name = self._joints[index]
         if code == EmergencyCode.NO_ERROR:
             return Notice("drive_emergency", "info", f"joint {name}: EMCY error reset", index)
-        label = EmergencyCode(code).name if code in list(EmergencyCode) else "unknown to the HAL"
-        text = f"joint {name}: EMCY {code:#06x} ({label}), register {register:#04x}, data {extra.hex(' ')}"
+        text = f"joint {name}: EMCY {code:#06x} ({emergency_text(code)}), register {register:#04x}"
+        text += f", data {extra.hex(' ')}"
         harmless = code in HARMLESS_EMERGENCIES
         return Notice("drive_emergency", "warning" if harmless else "error", text, index, stops=not harmless)
 
@@ -292,15 +339,16 @@ class Decoder:
             self._claim(bus, identifiers.TPDO2 + node, _MODE, index, TPDO_MODE.size, joint.name)
             self._claim(bus, identifiers.EMCY + node, _EMCY, index, EMCY_STRUCT.size, joint.name)
             self._claim(bus, identifiers.HEARTBEAT + node, _HEARTBEAT, index, 1, joint.name)
+            self._claim(bus, identifiers.SDO_TX + node, _SDO, index, 8, joint.name)
         for index, sensor in enumerate(robot.force_torque_sensors):
             bus = robot.bus_index(sensor.bus)
-            self._claim(bus, sensor.can_id, _FORCE, index, 8, sensor.name)
-            self._claim(bus, sensor.can_id + 1, _TORQUE, index, 8, sensor.name)
+            self._claim(bus, sensor.can_id, FORCE, index, 8, sensor.name)
+            self._claim(bus, sensor.can_id + 1, TORQUE, index, 8, sensor.name)
         for index, imu in enumerate(robot.imus):
             bus = robot.bus_index(imu.bus)
-            self._claim(bus, imu.base_id + sensors.GYRO_ID, _GYRO, index, 6, imu.name)
-            self._claim(bus, imu.base_id + sensors.ACCELERATION_ID, _ACCELERATION, index, 6, imu.name)
-            self._claim(bus, imu.base_id + sensors.QUATERNION_ID, _QUATERNION, index, 8, imu.name)
+            self._claim(bus, imu.base_id + sensors.GYRO_ID, GYRO, index, 6, imu.name)
+            self._claim(bus, imu.base_id + sensors.ACCELERATION_ID, ACCELERATION, index, 6, imu.name)
+            self._claim(bus, imu.base_id + sensors.QUATERNION_ID, QUATERNION, index, 8, imu.name)
 
     def _claim(self, bus: int, can_id: int, kind: int, index: int, length: int, owner: str) -> None:
         row = bus * _ANY_BUS + can_id
@@ -309,3 +357,11 @@ class Decoder:
                 f"{owner}: identifier {can_id:#05x} is used twice on its bus; give it another node or base id"
             )
         self._kind[row], self._index[row], self._length[row] = kind, index, length
+
+
+def mode_requests(node_id: int) -> bytes:
+    """SDO upload requests for mode display and error code, which a drive's TPDO2 tells on change alone."""
+    return b"".join(
+        pack(identifiers.SDO_RX + node_id, _SDO_HEAD.pack(_UPLOAD, index, 0) + bytes(4))
+        for index in (MODE_DISPLAY, ERROR_CODE)
+    )

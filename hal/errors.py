@@ -21,6 +21,10 @@ class BootError(HalError):
     """A node could not be brought to operation; the message names joint, object and both values."""
 
 
+class NodesMissingError(BootError):
+    """Nodes did not appear in time; the message names all of them."""
+
+
 class CommandRefused(HalError):  # noqa: N818 - a refusal is an answer, named as the event it becomes
     """A joint command is not fit to be applied; carries the field, its value and what was required."""
 

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from hal.boot import boot_network
+from hal.boot_objects import is_foreign
+from hal.bus.address import MAX_PACKET
+from hal.bus.error_frames import BUS_OFF
+from hal.bus.errors import BusDownError, BusStuckError
 from hal.bus.gather import PortGroup
-from hal.bus.ports import FramePort, RecordingPort
+from hal.bus.pacing import FRAMES_AHEAD
+from hal.bus.ports import DropCounting, FramePort, RecordingPort
+from hal.bus.socketcan import SocketCanPort
 from hal.cycle import HalCore
-from hal.profile.frames import can_ids, pack
+from hal.errors import BootError, HalError
+from hal.find import FoundNodes, find_nodes
+from hal.profile.frames import CAN_ERR_FLAG, FRAME_BYTES, can_ids, pack
 from hal.profile.identifiers import HAL_NODE_ID, HEARTBEAT, SYNC
 from schemas.messages import BusFrames, JointCommand, RobotState
 from schemas.robot import RobotDescription
@@ -19,6 +28,8 @@ from schemas.robot import RobotDescription
 BOOT_SEQUENCE: Final = -1
 OPERATIONAL: Final = 5
 """NMT state in a heartbeat."""
+HEARTBEAT_SHARE: Final = 0.5
+"""Of the heartbeat's period: the wall-clock time after which other makers' drives get the next one at the latest."""
 
 
 class Master:
@@ -33,24 +44,55 @@ class Master:
         self.core = HalCore(robot, session)
         self._robot = robot
         self._ports = [RecordingPort(port) for port in ports]
+        self._counting = [
+            (bus.name, port)
+            for bus, port in zip(robot.buses, ports, strict=False)  # the boot refuses a wrong number
+            if isinstance(port, DropCounting)
+        ]
+        self._found: FoundNodes | None = None
+        self._down = [False] * len(ports)
+        paced = any(isinstance(port, SocketCanPort) and port.paced for port in ports)
+        self._turn_bytes = FRAMES_AHEAD * FRAME_BYTES if paced else MAX_PACKET
+        """Sent on one bus before the next has its turn: while one paces its burst, the wires of the others carry on."""
         self._group = PortGroup(self._ports)
         self._sync = pack(SYNC, b"")
         self._heartbeat = pack(HEARTBEAT + HAL_NODE_ID, bytes([OPERATIONAL]))
         self._heartbeat_cycles = max(1, round(robot.safety.heartbeat_s * robot.rate_hz))
         self._heartbeat_due = 0
         """Sequence from which on the next heartbeat is sent: SYNCs may be left out."""
+        self._foreign = any(is_foreign(joint.drive) for joint in robot.joints)
+        """Some drive lives in wall-clock time, however slow a lockstep cycle is, and wants its heartbeats there."""
+        self._heartbeat_due_s = 0.0
         self._received: list[list[bytes]] = [[] for _ in ports]
         self._missing: list[set[int]] = [set() for _ in ports]
 
-    def boot(self, timeout_s: float) -> None:
-        """Configure and enable every drive, holding where it stands.
+    def find(self, timeout_s: float) -> None:
+        """Look for all nodes and see that they are those described; nothing is enabled.
+
+        Raises:
+            BootError: nodes missing or wrong; the message lists them.
+            BusDownError: an interface went down.
+
+        """
+        try:
+            self._found = find_nodes(self._robot, self._ports, timeout_s)
+        except BootError as error:
+            raise self._reason(error) from error
+
+    def boot(self, timeout_s: float) -> tuple[str, ...]:
+        """Configure and enable every drive, holding where it stands; returns what is worth knowing of them.
 
         Raises:
             BootError: nodes missing, wrong or unwilling; the message lists them.
+            BusDownError: an interface went down.
 
         """
-        report = boot_network(self._robot, self._ports, timeout_s)
+        try:
+            report = boot_network(self._robot, self._ports, timeout_s, self._found)
+        except BootError as error:
+            raise self._reason(error) from error
         self.core.start(np.array(report.position_measured))
+        return report.notes
 
     def sync(self, sequence: int) -> None:
         """Send SYNC on every bus, the HAL's heartbeat before it when one is due.
@@ -59,26 +101,35 @@ class Master:
         """
         for received in self._received:
             received.clear()
-        for index, frames in self._group.receive(0.0):
-            self._received[index].append(frames)
+        self._take_waiting()
         packet = self._sync
-        if sequence >= self._heartbeat_due:
+        if sequence >= self._heartbeat_due or (self._foreign and time.monotonic() >= self._heartbeat_due_s):
             self._heartbeat_due = sequence + self._heartbeat_cycles
+            self._heartbeat_due_s = time.monotonic() + HEARTBEAT_SHARE * self._robot.safety.heartbeat_s
             packet = self._heartbeat + self._sync
-        for port in self._ports:
-            port.send(packet)
+        for index in range(len(self._ports)):
+            self._send(index, packet)
 
     def gather(self, sequence: int, timeout_s: float) -> RobotState:
         """Await all reports of this SYNC, up to a time, and decode them; what is missing becomes an event."""
         self._missing = [set(expected) for expected in self.core.expected_reports]
-        self._group.gather(self._take, timeout_s)
+        if any(self._missing):
+            self._group.gather(self._take, timeout_s)
+        else:
+            self._take_waiting()
         return self.core.decode(sequence, [b"".join(received) for received in self._received])
 
     def apply(self, command: JointCommand | None) -> None:
         """Send the RPDOs that the core makes of a command, or of its absence."""
-        for port, packet in zip(self._ports, self.core.apply(command), strict=True):
-            if packet:
-                port.send(packet)
+        packets = self.core.apply(command)
+        for start in range(0, max(map(len, packets)), self._turn_bytes):
+            for index, packet in enumerate(packets):
+                if part := packet[start : start + self._turn_bytes]:
+                    self._send(index, part)
+
+    def drops(self) -> list[tuple[str, dict[str, int]]]:
+        """Name the buses whose interfaces or sockets have dropped frames since the last call, with the counts."""
+        return [(name, rises) for name, port in self._counting if (rises := port.drops())]
 
     def frames(self, sequence: int) -> list[BusFrames]:
         """All frames since the last call, bus by bus."""
@@ -93,7 +144,45 @@ class Master:
         """Leave the buses."""
         self._group.close()
 
+    def _take_waiting(self) -> None:
+        for index, frames in self._group.receive(0.0):
+            self._take(index, frames)
+
     def _take(self, index: int, packet: bytes) -> bool:
-        self._received[index].append(packet)
-        self._missing[index].difference_update(can_ids(packet))
+        """Keep what came on a bus; whether nothing is awaited any more on any."""
+        missing = self._missing[index]
+        if packet:
+            self._received[index].append(packet)
+            identifiers = can_ids(packet)
+            missing.difference_update(identifiers)
+            if max(identifiers) >= CAN_ERR_FLAG and any(map(_is_bus_off, identifiers)):
+                missing.clear()
+        else:  # the interface has just gone down
+            port = self._ports[index]
+            self._lose(index, port.down or f"bus {port.name}: the interface went down")
+            missing.clear()
         return not any(self._missing)
+
+    def _send(self, index: int, packet: bytes) -> None:
+        """Send on a bus; one that takes nothing now is told to the core, and tried again the next time."""
+        try:
+            self._ports[index].send(packet)
+        except BusStuckError as error:
+            self._lose(index, str(error))
+        else:
+            if self._down[index]:
+                self._down[index] = False
+                self.core.set_bus_down(index, None)
+
+    def _lose(self, index: int, reason: str) -> None:
+        self._down[index] = True
+        self.core.set_bus_down(index, reason)
+
+    def _reason(self, error: BootError) -> HalError:
+        """Tell of an interface that is down rather than of the nodes behind it."""
+        reasons = [reason for port in self._ports if (reason := port.down) is not None]
+        return BusDownError("; ".join(reasons)) if reasons else error
+
+
+def _is_bus_off(identifier: int) -> bool:
+    return bool(identifier & CAN_ERR_FLAG and identifier & BUS_OFF)

@@ -7,9 +7,11 @@ import time
 from contextlib import suppress
 from typing import Final
 
+from hal.bus.counters import describe
 from hal.bus.errors import BusLostError
 from hal.bus.ports import open_port
-from hal.errors import HalError
+from hal.errors import HalError, NodesMissingError
+from hal.filters import hal_filters
 from hal.master import Master
 from schemas.base import Clock
 from schemas.lifecycle import Lifecycle
@@ -21,7 +23,9 @@ from schemas.topics import MalformedMessageError, decode
 from schemas.transport import PeerLostError, open_service
 
 CONNECT_S: Final = 30.0
-"""Patience with a plant that is still starting."""
+"""Patience with a plant that is still starting, at least."""
+CONNECT_SHARE: Final = 5.0
+"""The same as a multiple of the processor time that the HAL took to start: a slow machine is slow for both."""
 BOOT_S: Final = 10.0
 LOOK_UP_S: Final = 0.02
 """How often signals, peers and the operator are looked at while a command is awaited."""
@@ -33,6 +37,8 @@ SIGNALLED: Final = 128
 """Exit code, plus the signal's number, of a run that a signal cut short: the shells' convention."""
 BLAME_S: Final = 0.2
 """Wait after the loss of a bus for the loss of the service that hosted it."""
+COUNT_S: Final = 1.0
+"""How often the drop counters of the interfaces are read."""
 
 
 class SafeStopError(HalError):
@@ -58,6 +64,8 @@ class HalService:
         self._next_sync_s = 0.0
         self._begun_s = 0.0
         self._last_error = ""
+        self._stopped_by = ""
+        self._count_due_s = 0.0
         self._answered = False
         self._missed_commands = 0
         for key in (self._keys.state, *(self._keys.bus(bus.name) for bus in self._robot.buses)):
@@ -80,6 +88,7 @@ class HalService:
                 if life.signalled is not None:
                     core.stop(signal.Signals(life.signalled).name, emergency=True)
                     break
+            lost = self._await_buses()
         except PeerLostError as loss:
             core.stop(str(loss))
             with suppress(BusLostError):  # a plant that hosts the bus takes it along, and `loss` tells of it
@@ -94,9 +103,35 @@ class HalService:
         if finished:
             core.leave()
         self._hold(cycles)
+        self._count_drops()
         if not finished and life.signalled is None:
-            reason = f"stopped at sequence {self._sequence}, the robot holds: {self._last_error}"
-            raise SafeStopError(reason) from core.cause
+            reason = f"stopped at sequence {self._sequence}, the robot holds: {self._stopped_by or self._last_error}"
+            raise SafeStopError(reason + lost) from core.cause
+
+    def _await_buses(self) -> str:
+        """Hold the other buses while one is in trouble, so that it finds its master when it comes back.
+
+        States are published as before. What is to be said of a bus that did not come back is returned.
+        """
+        core, life = self._core, self._life
+        patience_s = self._robot.safety.bus_recovery_s
+        deadline = time.monotonic() + patience_s
+        while core.troubled_buses and life.signalled is None:
+            begun = time.monotonic()
+            if begun >= deadline:
+                return f"\nNot recovered after {patience_s:g} s: bus {', '.join(core.troubled_buses)}"
+            self._exchange()
+            while self._commands.receive(0.0) is not None:
+                pass  # answers to these states: the robot is stopped
+            self._serve_operator()
+            life.check_peers()
+            self._master.apply(None)
+            self._sequence += 1
+            if not self._realtime:  # with no bus left nothing else takes time
+                time.sleep(max(0.0, begun + self._robot.period_s - time.monotonic()))
+        if life.signalled is not None:
+            core.stop(signal.Signals(life.signalled).name, emergency=True)
+        return ""
 
     def _blame_peers(self) -> None:
         """Give a peer's loss the time to be noticed: whoever hosts a virtual bus takes it along.
@@ -116,14 +151,18 @@ class HalService:
 
     def _cycle(self) -> None:
         """One period: SYNC, state out, command in, RPDOs out."""
-        self._sync()
-        sequence = self._sequence
-        state = self._master.gather(sequence, self._report_timeout_s)
-        self._life.stamp(sequence, state.time_ns)
-        self._life.publish(self._keys.state, state)
-        self._master.apply(self._await_command(sequence))
+        state = self._exchange()
+        self._master.apply(self._await_command(state.sequence))
         self._sequence += 1
         self._measure(state)
+
+    def _exchange(self) -> RobotState:
+        """Send a SYNC and publish what the robot answers."""
+        self._sync()
+        state = self._master.gather(self._sequence, self._report_timeout_s)
+        self._life.stamp(self._sequence, state.time_ns)
+        self._life.publish(self._keys.state, state)
+        return state
 
     def _hold(self, cycles: int) -> None:
         """Run cycles of the HAL's own: no state is published and no command awaited, the frames are logged."""
@@ -212,6 +251,8 @@ class HalService:
         for event in self._core.drain_events():
             if event.severity == "error":
                 self._last_error = event.text
+            if event.kind == "safe_stop":
+                self._stopped_by = event.text
             self._life.publish(self._keys.event, event)
 
     def _measure(self, state: RobotState) -> None:
@@ -220,29 +261,59 @@ class HalService:
         self._begun_s = now
         self._meter.missed_commands += self._core.missed_commands - self._missed_commands
         self._missed_commands = self._core.missed_commands
+        if now >= self._count_due_s:
+            self._count_due_s = now + COUNT_S
+            self._count_drops()
         last = self._sequence >= self._run.cycles
         if (summary := self._meter.report(state.sequence, state.time_ns, now, final=last)) is not None:
             self._life.publish(self._keys.health, summary)
 
+    def _count_drops(self) -> None:
+        for bus, rises in self._master.drops():
+            self._life.event("frames_dropped", f"bus {bus}: frames were lost: {describe(rises)}", "warning")
+
 
 def run_hal(run: Run, options: ServiceOptions) -> int:
-    """Boot the robot, run its cycles, leave it holding; returns the exit code.
+    """Find the robot's nodes, join the run, boot them, run the cycles, leave them holding; returns the exit code.
 
     Raises:
         BusUnavailableError: a bus cannot be opened.
-        BootError: nodes missing or wrong.
+        BootError: nodes missing or wrong; told at once, whether or not anybody else is there.
         SafeStopError, PeerLostError, BusLostError: see `HalService.run`.
 
     """
     robot = run.robot.description
     needed = tuple(peer for peer in ("plant", "controller") if peer in options.peers)
     with Lifecycle(open_service("hal", run, options), needed) as life:
-        master = Master(robot, [open_port(bus, CONNECT_S) for bus in robot.buses], options.session)
+        patience_s = max(CONNECT_S, CONNECT_SHARE * time.process_time())
+        ports = [open_port(bus, patience_s, hal_filters(robot, bus.name)) for bus in robot.buses]
+        master = Master(robot, ports, options.session)
         try:
             service = HalService(run, master, life)
+            _find(master, life, patience_s if "plant" in options.peers else 0.0)
             life.join(options.peers)
-            master.boot(BOOT_S)
+            for note in master.boot(BOOT_S):
+                life.event("boot_note", note, "warning")
             service.run()
         finally:
             master.close()
     return 0 if life.signalled is None else SIGNALLED + life.signalled
+
+
+def _find(master: Master, life: Lifecycle, patience_s: float) -> None:
+    """Look for the nodes until they are there; no longer than once when the plant is there, or none is expected.
+
+    Raises:
+        BootError: nodes missing or wrong.
+
+    """
+    deadline = time.monotonic() + patience_s
+    while life.signalled is None:  # whoever asked to stop meanwhile is heard when the run is joined
+        last = "plant" in life.transport.alive or time.monotonic() + BOOT_S > deadline
+        try:
+            master.find(BOOT_S)
+        except NodesMissingError:
+            if last:
+                raise
+        else:
+            return

@@ -36,11 +36,18 @@ class Supervisor:
         """Drives in Operation Enabled."""
         self.silent_joints: frozenset[int] = frozenset()
         """Joints whose drives have been silent for `sync_timeout_cycles`."""
+        self._lost: frozenset[int] = frozenset()
+        """Of these, the ones that were told of."""
+        self._absent: Mask = np.zeros(count, dtype=bool)
 
     @property
     def silent_sensors(self) -> frozenset[str]:
         """Sensors without a whole reading for `sync_timeout_cycles`."""
         return self._silent_sensors
+
+    def excuse(self, joints: Mask) -> None:
+        """Name the joints whose bus is in trouble: that they are silent, or in an old mode, is not told."""
+        self._absent = joints
 
     def review(self, measured: Measured, mode: OperationMode, sensor_ages: dict[str, int]) -> list[Notice]:
         """List the findings of one cycle.
@@ -48,7 +55,7 @@ class Supervisor:
         Args:
             measured: the decoded cycle.
             mode: that every drive should be in since this SYNC.
-            sensor_ages: cycles since the last whole reading of each sensor.
+            sensor_ages: cycles since the last whole reading of each sensor, of those whose bus is not in trouble.
         """
         notices = list(measured.notices)
         self._review_states(measured, notices)
@@ -76,16 +83,18 @@ class Supervisor:
 
     def _review_silence(self, measured: Measured, notices: list[Notice]) -> None:
         if not np.count_nonzero(measured.silent_cycles):
-            self.silent_joints = frozenset()
+            self.silent_joints = self._lost = frozenset()
             return
-        for joint in np.flatnonzero(measured.silent_cycles == 1).tolist():
+        silent = np.where(self._absent, 0, measured.silent_cycles)
+        for joint in np.flatnonzero(silent == 1).tolist():
             text = f"joint {self._joints[joint]}: no report of the drive in this cycle; the last one is kept"
             notices.append(Notice("report_missing", "warning", text, joint))
-        for joint in np.flatnonzero(measured.silent_cycles == self._patience).tolist():
+        lost = frozenset(np.flatnonzero(silent >= self._patience).tolist())
+        for joint in sorted(lost - self._lost):
             text = f"joint {self._joints[joint]}: drive silent for {self._patience} cycles; check its power and its bus"
             notices.append(Notice("node_lost", "error", text, joint, stops=True))
-        silent = np.flatnonzero(measured.silent_cycles >= self._patience).tolist()
-        self.silent_joints = frozenset(silent)
+        self._lost = lost
+        self.silent_joints = frozenset(np.flatnonzero(measured.silent_cycles >= self._patience).tolist())
 
     def _review_modes(self, measured: Measured, mode: OperationMode, notices: list[Notice]) -> None:
         right = self._right
@@ -97,7 +106,7 @@ class Supervisor:
             self._right = measured.mode, mode
             return
         self._right = None
-        wrong &= self.enabled
+        wrong &= self.enabled & ~self._absent
         self._wrong_mode = np.where(wrong, self._wrong_mode + 1, 0)
         for joint in np.flatnonzero(self._wrong_mode == self._patience).tolist():
             text = (

@@ -2,84 +2,63 @@
 
 Pure: frames and times [ns] come in, frames of 16 bytes go out. Choices where the standards leave room:
 
-- An RPDO of any wrong length is dropped with EMCY 0x8210; the next right one takes the error back.
+- A short RPDO is dropped with EMCY 0x8210, of a long one the mapped bytes are taken with EMCY 0x8220; an RPDO of the
+  right length takes the error back at its SYNC.
 - Event-driven TPDOs (types 254, 255) go out with the answer to the SYNC, or at a tick while no SYNC is running.
 - Watchdogs (`Watchdogs`) over SYNC (EMCY 0x8100) and RPDOs (EMCY 0x8250) make the drive hold by its own means
   (`Power.lose_command`). A torque written by SDO counts as a command.
 - Leaving OPERATIONAL, or losing the heartbeat of 0x1016 (EMCY 0x8130), acts by option 0x6007: 0 hold as above, 1 fault,
-  2 disable voltage, 3 quick stop. A fault cannot be reset while the heartbeat is missing.
+  2 disable voltage, 3 quick stop; then by 0x1029 a lost heartbeat changes the NMT state. A fault cannot be reset while
+  the heartbeat is missing, and what caused it stays in 0x1001 and 0x603F until then.
+- NMT reset communication leaves the power state alone (but for 0x6007): a drive in FAULT stays there with its errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from hal.profile import frames, identifiers, objects
-from hal.profile.cia402 import EmergencyCode, StatusBit
+from hal.profile import identifiers, objects
+from hal.profile.cia402 import EmergencyCode
 from plant_service.axis import Axis
-from plant_service.drive_objects import K_ABORT_OPTION, K_SYNC_COB_ID, abort_connection, configure_all, install_hooks
-from plant_service.emergency import Emergency
-from plant_service.nmt import HeartbeatConsumer, HeartbeatProducer, NmtReset, NmtSlave, NmtState
-from plant_service.object_dictionary import DeviceDictionary, key_of
-from plant_service.pdo import CAN_ID_BITS, Rpdo, Tpdo
+from plant_service.drive_objects import K_ABORT_OPTION, abort_connection, configure_all, install_hooks
+from plant_service.nmt import NmtReset
+from plant_service.node import OPERATIONAL, CanopenNode
+from plant_service.object_dictionary import key_of
+from plant_service.pdo import Rpdo
 from plant_service.power import CST, K_TORQUE, K_TORQUE_ACTUAL, OPERATION_ENABLED, Power
-from plant_service.sdo_server import SdoServer
-from plant_service.watchdog import SYNC_TIMEOUT, Watchdogs
+from plant_service.watchdog import K_WATCHDOG, SYNC_TIMEOUT, Watchdogs
 from schemas.messages import DriveState
-
-PDO_COUNT: Final = 2
-"""Of each direction."""
 
 K_STATUSWORD = key_of(objects.STATUSWORD)
 K_POSITION_ACTUAL = key_of(objects.POSITION_ACTUAL)
 K_TORQUE_DEMAND = key_of(objects.TORQUE_DEMAND)
 K_SUPPORTED = key_of(objects.SUPPORTED_DRIVE_MODES)
-REMOTE: Final = int(StatusBit.REMOTE)
-OPERATIONAL: Final = NmtState.OPERATIONAL
+K_ERROR_BEHAVIOUR = key_of(objects.ERROR_BEHAVIOUR, 1)
+LENGTH_ERRORS: Final = (EmergencyCode.PDO_LENGTH, EmergencyCode.PDO_LENGTH_EXCEEDED, EmergencyCode.SYNC_LENGTH)
+"""Errors of the communication alone, which end by themselves."""
+FAULTY: Final = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 
 
-class DriveDevice:
-    """One drive. `fixed` overrides defaults of the EDS for this device, by `key_of` (identity, supported modes, …)."""
+class DriveDevice(CanopenNode):
+    """One drive."""
 
     def __init__(
         self, node_id: int, axis: Axis, fixed: Mapping[int, int] | None = None, eds: Path | None = None
     ) -> None:
-        self.node_id = node_id
-        self.revision = 0
-        """Grows when the device listens to other identifiers than before."""
+        super().__init__(node_id, fixed, eds)
         self._axis = axis
-        self._fixed = dict(fixed or {})
-        self.dictionary = DeviceDictionary(eds or Path(objects.eds_path()), node_id)
-        self._values: dict[int, Any] = self.dictionary.values
-        self._values.update(self._fixed)
-        self.emergency = Emergency(self.dictionary)
-        self.nmt = NmtSlave(node_id)
         self.power = Power(self._values, axis, self._values[K_SUPPORTED])
-        self._producer = HeartbeatProducer(self.dictionary, self.nmt)
-        self._consumer = HeartbeatConsumer(self.dictionary)
-        self._sdo = SdoServer(self.dictionary)
         self._watchdogs = Watchdogs(self._values)
-        self._rpdo_of: dict[int, Rpdo] = {}
-        self._rpdos: tuple[Rpdo, ...] = ()
-        self._tpdos: tuple[Tpdo, ...] = ()
-        self._valid_tpdos: tuple[Tpdo, ...] = ()
-        self._rpdos = tuple(Rpdo(self.dictionary, number, self._route) for number in range(PDO_COUNT))
-        self._tpdos = tuple(Tpdo(self.dictionary, number, self._route) for number in range(PDO_COUNT))
-        self._route()
         self._pending: dict[Rpdo, bytes] = {}
+        """What the next SYNC latches, in the order of arrival."""
+        self._commanded = False
+        """An RPDO was taken since errors were last looked through."""
         self._now_ns = 0
         self._due_ns = 0
         """Before this time a tick has nothing to do but to measure the speed; 0: see at the next tick."""
-        install_hooks(self.dictionary, axis, self.power.supports, setpoint=self._set_by_sdo, routes=self._route)
-        self._outbox = [self.nmt.boot()]
-
-    @property
-    def can_ids(self) -> frozenset[int]:
-        """Identifiers that this device listens to now."""
-        others = {identifiers.NMT, self._sync_id, identifiers.SDO_RX + self.node_id}
-        return frozenset(others | set(self._rpdo_of) | ({self._consumer.can_id} - {0}))
+        install_hooks(self.dictionary, axis, self.power.supports, self._set_by_sdo)
 
     @property
     def state(self) -> DriveState:
@@ -98,19 +77,18 @@ class DriveDevice:
             return self.sync(now_ns, data)
         self._due_ns = 0
         if can_id == identifiers.SDO_RX + self.node_id:
-            if self.nmt.state is not NmtState.STOPPED:
-                self._request(data)
+            self._sample()
+            self._answer(data)
         elif can_id == identifiers.NMT:
             self._command(data)
-        elif can_id == self._consumer.can_id and self._consumer.hear(now_ns):
+        elif can_id == self._consumer.can_id and self._consumer.hear(now_ns) and self.power.state not in FAULTY:
             self.emergency.vanish(EmergencyCode.HEARTBEAT_LOST)
         return self._flush()
 
     def sync(self, now_ns: int, data: bytes = b"") -> list[bytes]:
         """Latch what came since the last SYNC, sample, and answer: EMCY, then the TPDOs that are due."""
         self._now_ns = now_ns
-        if data:
-            self.emergency.appear(EmergencyCode.SYNC_LENGTH)
+        if (data or self._sync_length) and not self._count(data):
             return self._flush()
         if self.nmt.state is not OPERATIONAL:
             return self._flush()
@@ -128,7 +106,7 @@ class DriveDevice:
         if self.emergency.active:
             self._recover()
         sent = self._flush()
-        for tpdo in self._valid_tpdos:
+        for tpdo in self._active_tpdos:
             frame = tpdo.at_sync(now_ns)
             if frame is not None:
                 sent.append(frame)
@@ -142,14 +120,13 @@ class DriveDevice:
             return []
         self._watch(now_ns)
         if self._consumer.tick(now_ns):
-            self.emergency.appear(EmergencyCode.HEARTBEAT_LOST)
-            self._abort_connection(EmergencyCode.HEARTBEAT_LOST)
+            self._lose_heartbeat()
         heartbeat = self._producer.tick(now_ns)
         sent = self._flush()
         without_sync = self._watchdogs.sync_ns is None and self.nmt.state is OPERATIONAL
         if without_sync:
             self._sample()
-            for tpdo in self._valid_tpdos:
+            for tpdo in self._active_tpdos:
                 frame = tpdo.by_event(now_ns)
                 if frame is not None:
                     sent.append(frame)
@@ -167,12 +144,18 @@ class DriveDevice:
     # ---- what arrives
 
     def _receive_rpdo(self, rpdo: Rpdo, data: bytes) -> None:
-        if len(data) != rpdo.codec.size:
-            self.emergency.appear(EmergencyCode.PDO_LENGTH)
-            return
+        size = rpdo.codec.size
+        if len(data) != size:
+            self._misfit = True
+            if len(data) < size:
+                self.emergency.appear(EmergencyCode.PDO_LENGTH)
+                return
+            self.emergency.appear(EmergencyCode.PDO_LENGTH_EXCEEDED)
+            data = data[:size]
         if self._watchdogs.command_ns is None or rpdo.received_ns is None:
             self._due_ns = 0
         self._watchdogs.command_ns = rpdo.received_ns = self._now_ns
+        self._commanded = True
         if rpdo.synchronous:
             self._pending.pop(rpdo, None)
             self._pending[rpdo] = data
@@ -188,8 +171,7 @@ class DriveDevice:
         power = self.power
         state, mode = power.state, power.mode
         if power.receive(keys, can_reset=not self._consumer.lost):
-            kept = (EmergencyCode.PDO_LENGTH, EmergencyCode.SYNC_LENGTH)
-            self.emergency.vanish(*(code for code in self.emergency.active if code not in kept))
+            self.emergency.vanish(*(code for code in self.emergency.active if code not in LENGTH_ERRORS))
         if power.state is not state or power.mode != mode:
             self._due_ns = 0
 
@@ -197,24 +179,31 @@ class DriveDevice:
         if self.power.latch():
             self.fault(EmergencyCode.FOLLOWING_ERROR)
 
-    def _request(self, data: bytes) -> None:
-        self._sample()
-        answer = self._sdo.request(data)
-        if answer is not None:
-            self._outbox.append(frames.pack(identifiers.SDO_TX + self.node_id, answer))
-
     def _command(self, data: bytes) -> None:
         before = self.nmt.state
         reset = self.nmt.command(data)
+        leaves = before is OPERATIONAL and (reset is not None or self.nmt.state is not OPERATIONAL)
+        if leaves:
+            self._silence()
+            if reset is not NmtReset.NODE:
+                self._abort_connection(SYNC_TIMEOUT)
         if reset is not None:
             self._reset(node=reset is NmtReset.NODE)
-        elif before is NmtState.OPERATIONAL and self.nmt.state is not NmtState.OPERATIONAL:
-            self._watchdogs.clear()
-            self._pending.clear()
-            self._abort_connection(SYNC_TIMEOUT)
-        elif self.nmt.state is NmtState.OPERATIONAL and before is not NmtState.OPERATIONAL:
-            for tpdo in self._tpdos:
-                tpdo.last = None
+        elif before is not OPERATIONAL and self.nmt.state is OPERATIONAL:
+            self._start_tpdos()
+
+    def _silence(self) -> None:
+        """Leave OPERATIONAL: expect no more PDOs and SYNCs."""
+        self._watchdogs.clear(self._rpdos)
+        self._pending.clear()
+
+    def _lose_heartbeat(self) -> None:
+        self.emergency.appear(EmergencyCode.HEARTBEAT_LOST)
+        self._abort_connection(EmergencyCode.HEARTBEAT_LOST)
+        self._outbox = self._flush()
+        state = self.nmt.lose_heartbeat(self._values[K_ERROR_BEHAVIOUR])
+        if state is not OPERATIONAL:
+            self._silence()
 
     # ---- what the device does by itself
 
@@ -229,62 +218,46 @@ class DriveDevice:
     def _report(self) -> None:
         values, power = self._values, self.power
         values[K_TORQUE_DEMAND] = values[K_TORQUE] if power.mode == CST and power.following else 0
-        remote = REMOTE if self.nmt.state is OPERATIONAL else 0
-        values[K_STATUSWORD] = power.statusword() | remote
+        values[K_STATUSWORD] = power.statusword()
 
     def _watch(self, now_ns: int) -> None:
-        if self.power.state is OPERATION_ENABLED:
-            torque = self.power.mode == CST
-            for code in self._watchdogs.expired(self._rpdo_of.values(), now_ns, torque=torque):
-                self.emergency.appear(code)
-                self.power.lose_command()
+        enabled, torque = self.power.state is OPERATION_ENABLED, self.power.mode == CST
+        for code in self._watchdogs.expired(self._rpdo_of.values(), now_ns, enabled=enabled, torque=torque):
+            self._commanded = False
+            self.emergency.appear(code)
+            self.power.lose_command()
 
     def _next_due_ns(self) -> int:
-        due_ns = min(self._consumer.due_ns, self._producer.due_ns)
-        if self.power.state is OPERATION_ENABLED:
-            torque = self.power.mode == CST
-            due_ns = min(due_ns, self._watchdogs.due_ns(self._rpdo_of.values(), torque=torque))
-        return due_ns
+        enabled, torque = self.power.state is OPERATION_ENABLED, self.power.mode == CST
+        due_ns = self._watchdogs.due_ns(self._rpdo_of.values(), enabled=enabled, torque=torque)
+        return min(due_ns, self._consumer.due_ns, self._producer.due_ns)
 
     def _recover(self) -> None:
         """Take back the errors whose cause is gone: PDOs of the right length, a fresh start after a hold."""
-        commanded = self._watchdogs.command_ns == self._now_ns
-        gone = [EmergencyCode.PDO_LENGTH, EmergencyCode.SYNC_LENGTH] if commanded else []
-        if not self.power.left_alone and self.power.state is OPERATION_ENABLED:
-            self.emergency.vanish(SYNC_TIMEOUT, EmergencyCode.RPDO_TIMEOUT)
+        gone: list[int] = []
+        commanded = self._commanded
+        if commanded and not self._misfit:
+            gone += LENGTH_ERRORS
+        self._misfit = self._commanded = False
+        if not self.power.left_alone:
+            if self.power.state is OPERATION_ENABLED:
+                gone += (SYNC_TIMEOUT, EmergencyCode.RPDO_TIMEOUT)
+            elif commanded:
+                gone.append(EmergencyCode.RPDO_TIMEOUT)
         self.emergency.vanish(*gone)
 
     def _abort_connection(self, code: int) -> None:
-        if abort_connection(self.power, self._values[K_ABORT_OPTION], self._now_ns):
+        watched = bool(self._values[K_WATCHDOG])
+        if abort_connection(self.power, self._values[K_ABORT_OPTION], self._now_ns, watched=watched):
             self.fault(code)
 
     def _reset(self, *, node: bool) -> None:
-        self.dictionary.reset(last=0xFFFF if node else 0x1FFF)
-        self._values.update(self._fixed)
-        self.emergency.forget()
-        self._sdo.reset()
-        self._consumer.reset()
-        self._pending.clear()
-        self._watchdogs.clear()
-        for pdo in (*self._rpdos, *self._tpdos):
-            pdo.rebuild()
+        self._reset_objects(node=node, faulty=not node and self.power.state in FAULTY)
         if node:
             self.power.reset()
             configure_all(self.dictionary, self._axis)
         else:
             self.power.release()
-        self._outbox = [self.nmt.boot()]
-
-    def _flush(self) -> list[bytes]:
-        if not self._outbox and not self.emergency.frames:
-            return []
-        sent = self._outbox
-        if self.emergency.frames:
-            if self.nmt.state is not NmtState.STOPPED:
-                sent += self.emergency.frames
-            self.emergency.frames.clear()
-        self._outbox = []
-        return sent
 
     # ---- what SDO writes do
 
@@ -293,9 +266,3 @@ class DriveDevice:
             self._watchdogs.command_ns = self._now_ns
         self._act((key,))
         self._latch()
-
-    def _route(self) -> None:
-        self._sync_id = self._values[K_SYNC_COB_ID] & CAN_ID_BITS
-        self._rpdo_of = {rpdo.can_id: rpdo for rpdo in self._rpdos if rpdo.valid}
-        self._valid_tpdos = tuple(tpdo for tpdo in self._tpdos if tpdo.valid)
-        self.revision += 1

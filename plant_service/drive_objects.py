@@ -8,15 +8,27 @@ from typing import Final
 
 from hal.profile import objects
 from hal.profile.cia402 import AbortConnectionOption
+from hal.profile.stop_options import (
+    DisableOperationOption,
+    FaultReactionOption,
+    HaltOption,
+    QuickStopOption,
+    ShutdownOption,
+)
 from plant_service.axis import Axis, AxisGains
-from plant_service.nmt import K_CONSUMER
 from plant_service.object_dictionary import AbortCode, DeviceDictionary, key_of
-from plant_service.pdo import CAN_ID_BITS
 from plant_service.power import K_CONTROLWORD, K_MAX_TORQUE, K_MODE, K_POSITION, K_TORQUE, Power
 
-K_SYNC_COB_ID: Final = key_of(objects.SYNC_COB_ID)
 K_ABORT_OPTION: Final = key_of(objects.ABORT_CONNECTION_OPTION)
-K_COUNTER: Final = key_of(objects.SYNC_COUNTER)
+OPTION_CODES: Final = {
+    K_ABORT_OPTION: frozenset(AbortConnectionOption),
+    key_of(objects.QUICK_STOP_OPTION): frozenset(QuickStopOption),
+    key_of(objects.SHUTDOWN_OPTION): frozenset(ShutdownOption),
+    key_of(objects.DISABLE_OPERATION_OPTION): frozenset(DisableOperationOption),
+    key_of(objects.HALT_OPTION): frozenset(HaltOption),
+    key_of(objects.FAULT_REACTION_OPTION): frozenset(FaultReactionOption),
+}
+"""Option code → values that the drive has; others are refused."""
 GAIN_FIELDS: Final = {
     key_of(objects.POSITION_GAIN): ("position_gain", 1e-3),
     key_of(objects.VELOCITY_GAIN): ("velocity_gain", 1e-3),
@@ -31,18 +43,15 @@ def install_hooks(
     dictionary: DeviceDictionary,
     axis: Axis,
     supports: Callable[[int], bool],
-    *,
     setpoint: Callable[[int], None],
-    routes: Callable[[], None],
 ) -> None:
     """Have SDO downloads act.
 
     Args:
-        dictionary: of the drive; the heartbeat consumer's hooks are in it already.
+        dictionary: of the drive.
         axis: takes the firmware parameters.
         supports: whether the drive has a mode.
         setpoint: called with the key after an object that commands the drive was written.
-        routes: called after the drive came to listen to another identifier.
 
     """
     written = dictionary.written
@@ -51,25 +60,20 @@ def install_hooks(
         written[key] = partial(_configure, axis, key)
     for key in (K_CONTROLWORD, K_MODE, K_POSITION, K_TORQUE, K_MAX_TORQUE):
         written[key] = partial(_call, setpoint, key)
-    written[K_SYNC_COB_ID] = lambda _: routes()
-    watch = written[K_CONSUMER]
-
-    def watch_another(value: int) -> None:
-        watch(value)
-        routes()
-
-    written[K_CONSUMER] = watch_another
 
 
-def abort_connection(power: Power, option: int, now_ns: int) -> bool:
-    """Act by option 0x6007 when the connection to the master is lost; returns whether the drive is to fault."""
+def abort_connection(power: Power, option: int, now_ns: int, *, watched: bool) -> bool:
+    """Act by option 0x6007 when the connection to the master is lost; returns whether the drive is to fault.
+
+    Option 0, "no action", leaves the drive to the maker's watchdogs, which hold it at once if they are on (`watched`).
+    """
     if option == AbortConnectionOption.FAULT_SIGNAL:
         return True
     if option == AbortConnectionOption.DISABLE_VOLTAGE:
         power.disable_voltage()
     elif option == AbortConnectionOption.QUICK_STOP:
         power.quick_stop(now_ns)
-    else:
+    elif watched:
         power.lose_command()
     return False
 
@@ -79,21 +83,19 @@ def _call(act: Callable[[int], None], key: int, _: int) -> None:
 
 
 def _install_checks(dictionary: DeviceDictionary, supports: Callable[[int], bool]) -> None:
-    """Have the dictionary refuse modes that the drive lacks, a SYNC producer, and a SYNC counter."""
+    """Have the dictionary refuse the modes and option codes that the drive lacks."""
+    entries = dictionary.entries
 
     def check_mode(mode: int) -> None:
         if not supports(mode):
-            raise dictionary.entries[K_MODE].abort(AbortCode.VALUE_INVALID)
+            raise entries[K_MODE].abort(AbortCode.VALUE_INVALID)
 
-    def check_sync(value: int) -> None:
-        if value & ~CAN_ID_BITS or not value & CAN_ID_BITS:  # bit 30 would make it a producer
-            raise dictionary.entries[K_SYNC_COB_ID].abort(AbortCode.VALUE_INVALID)
+    def check_option(key: int, value: int) -> None:
+        if value not in OPTION_CODES[key]:
+            raise entries[key].abort(AbortCode.VALUE_INVALID)
 
-    def check_counter(value: int) -> None:
-        if value:
-            raise dictionary.entries[K_COUNTER].abort(AbortCode.VALUE_INVALID)
-
-    dictionary.on_write |= {K_MODE: check_mode, K_SYNC_COB_ID: check_sync, K_COUNTER: check_counter}
+    dictionary.on_write[K_MODE] = check_mode
+    dictionary.on_write |= {key: partial(check_option, key) for key in OPTION_CODES}
 
 
 def configure_all(dictionary: DeviceDictionary, axis: Axis) -> None:

@@ -55,11 +55,7 @@ class Emergency:
         if code in self.active:
             return
         self.active[code] = register_of(code)
-        count = min(self._values[COUNT] + 1, HISTORY_LENGTH)
-        for subindex in range(count, 1, -1):
-            self._values[key_of(ERROR_HISTORY, subindex)] = self._values[key_of(ERROR_HISTORY, subindex - 1)]
-        self._values[key_of(ERROR_HISTORY, 1)] = code
-        self._values[COUNT] = count
+        self._remember(code)
         self._report(code)
 
     def vanish(self, *codes: int) -> None:
@@ -70,11 +66,26 @@ class Emergency:
         if gone:
             self._report(EmergencyCode.NO_ERROR)
 
-    def forget(self) -> None:
-        """Start anew without a report: a reset."""
-        self.active.clear()
-        self.frames.clear()
+    def restart(self, *, faulty: bool) -> None:
+        """Start anew after the dictionary was reset, without a report.
+
+        Args:
+            faulty: the drive stays in fault, so its errors are still present and make up the history.
+
+        """
+        if not faulty:
+            self.active.clear()
+            self.frames.clear()
+        for code in self.active:
+            self._remember(code)
         self._update()
+
+    def _remember(self, code: int) -> None:
+        count = min(self._values[COUNT] + 1, HISTORY_LENGTH)
+        for subindex in range(count, 1, -1):
+            self._values[key_of(ERROR_HISTORY, subindex)] = self._values[key_of(ERROR_HISTORY, subindex - 1)]
+        self._values[key_of(ERROR_HISTORY, 1)] = code
+        self._values[COUNT] = count
 
     def _update(self) -> int:
         register = 0

@@ -10,6 +10,9 @@ from hal.profile.objects import CONSUMER_HEARTBEAT, PRODUCER_HEARTBEAT_MS
 from plant_service.object_dictionary import DeviceDictionary, key_of
 
 NEVER_NS: Final = 2**63
+LEAVE_OPERATIONAL: Final = 0
+STOP_NODE: Final = 2
+"""Values of 0x1029:1, beside 1 for no change."""
 K_PRODUCER: Final = key_of(PRODUCER_HEARTBEAT_MS)
 K_CONSUMER: Final = key_of(CONSUMER_HEARTBEAT, 1)
 
@@ -58,6 +61,14 @@ class NmtSlave:
             return None
         return NmtReset(data[0]) if data[0] in (NmtReset.NODE.value, NmtReset.COMMUNICATION.value) else None
 
+    def lose_heartbeat(self, behaviour: int) -> NmtState:
+        """Take the state that object 0x1029:1 wants after a lost heartbeat; the state then."""
+        if behaviour == STOP_NODE:
+            self.state = NmtState.STOPPED
+        elif behaviour == LEAVE_OPERATIONAL and self.state is NmtState.OPERATIONAL:
+            self.state = NmtState.PRE_OPERATIONAL
+        return self.state
+
 
 class HeartbeatProducer:
     """Sends the NMT state every 0x1017 ms."""
@@ -90,13 +101,12 @@ class HeartbeatProducer:
 
 
 class HeartbeatConsumer:
-    """Watches the node of 0x1016:1 (node << 16 | ms) from its first heartbeat on."""
+    """Watches the node of 0x1016:1 (node << 16 | ms) from its first heartbeat on; to be reset when that changes."""
 
     def __init__(self, dictionary: DeviceDictionary) -> None:
         self._values = dictionary.values
         self._heard_ns: int | None = None
         self.lost = False
-        dictionary.written[K_CONSUMER] = lambda _: self.reset()
 
     def reset(self) -> None:
         """Wait for the first heartbeat again."""
@@ -107,8 +117,8 @@ class HeartbeatConsumer:
     def can_id(self) -> int:
         """Identifier of the watched heartbeat; 0 when none is watched."""
         entry = self._values[K_CONSUMER]
-        node_id = entry >> 16 & 0x7F
-        return identifiers.HEARTBEAT + node_id if node_id and entry & 0xFFFF else 0
+        node_id = entry >> 16 & 0xFF
+        return identifiers.HEARTBEAT + node_id if 0 < node_id < 128 and entry & 0xFFFF else 0
 
     @property
     def due_ns(self) -> int:

@@ -13,7 +13,8 @@ from operator import itemgetter
 from typing import Any, Final
 
 from hal.profile.identifiers import COB_ID_INVALID
-from hal.profile.objects import RPDO_COMMUNICATION, RPDO_MAPPING, TPDO_COMMUNICATION, TPDO_MAPPING
+from hal.profile.objects import RPDO_COMMUNICATION, RPDO_MAPPING, SYNC_COUNTER, TPDO_COMMUNICATION, TPDO_MAPPING
+from plant_service.nmt import NEVER_NS
 from plant_service.object_dictionary import AbortCode, DeviceDictionary, Entry, key_of
 
 CAN_ID_BITS: Final = 0x7FF
@@ -23,6 +24,7 @@ FRAME_DATA: Final = 8
 MAXIMUM_ENTRIES: Final = 8
 LAST_CYCLIC_TYPE: Final = 240
 EVENT_TYPES: Final = (254, 255)
+K_SYNC_COUNTER: Final = key_of(SYNC_COUNTER)
 RESTRICTED: Final = (
     (0x000, 0x07F),
     (0x101, 0x180),
@@ -35,14 +37,15 @@ RESTRICTED: Final = (
 
 
 def check_can_id(value: int, entry: Entry) -> None:
-    """Refuse a COB-ID with a 29-bit or restricted identifier.
+    """Refuse a COB-ID with a 29-bit identifier, or with a restricted one that is to be valid (bit 31 clear).
 
     Raises:
         SdoAbort: VALUE_INVALID.
 
     """
     can_id = value & CAN_ID_BITS
-    restricted = any(first <= can_id <= last for first, last in RESTRICTED)
+    used = not value & COB_ID_INVALID
+    restricted = used and any(first <= can_id <= last for first, last in RESTRICTED)
     if value & EXTENDED_IDENTIFIER or value & 0x1FFF_F800 or restricted:
         raise entry.abort(AbortCode.VALUE_INVALID)
 
@@ -83,7 +86,7 @@ class Pdo:
         hooks[key_of(mapping, 0)] = self._check_count
         for subindex in range(1, MAXIMUM_ENTRIES + 1):
             hooks[key_of(mapping, subindex)] = partial(self._check_entry, subindex)
-        for subindex in (1, 2, 3, 5):
+        for subindex in (1, 2, 3, 5, 6):
             dictionary.written[key_of(communication, subindex)] = self._rebuild
         dictionary.written[key_of(mapping, 0)] = self._rebuild
         self._rebuild(0)
@@ -134,9 +137,9 @@ class Pdo:
         if self._exists():
             raise self._entry(self._communication, 3).abort(AbortCode.DEVICE_STATE)
 
-    def _check_sync_start(self, value: int) -> None:
-        if value:  # SYNC carries no counter here
-            raise self._entry(self._communication, 6).abort(AbortCode.VALUE_INVALID)
+    def _check_sync_start(self, _: int) -> None:
+        if self._exists():
+            raise self._entry(self._communication, 6).abort(AbortCode.DEVICE_STATE)
 
     def _check_entry(self, subindex: int, value: int) -> None:
         own = self._entry(self._mapping, subindex)
@@ -169,7 +172,15 @@ class Rpdo(Pdo):
 
     def __init__(self, dictionary: DeviceDictionary, number: int, changed: Callable[[], None]) -> None:
         self.received_ns: int | None = None
+        """When it came last; None: its deadline is not watched before it comes again."""
         super().__init__(dictionary, RPDO_COMMUNICATION + number, RPDO_MAPPING + number, changed, sent=False)
+
+    @property
+    def deadline_ns(self) -> int:
+        """Time by which it must have come again, by its event timer."""
+        if self.received_ns is None or not self.event_timer_ns:
+            return NEVER_NS
+        return self.received_ns + self.event_timer_ns
 
 
 def _nothing(_: dict[int, Any]) -> tuple[Any, ...]:
@@ -186,13 +197,17 @@ class Tpdo(Pdo):
         """Values in `last`."""
         self._sent_ns = 0
         self._syncs = 0
+        self._start = 0
+        self.waiting = False
+        """For the SYNC whose counter is the SYNC start value."""
         self._values = dictionary.values
         self._select: Callable[[dict[int, Any]], tuple[Any, ...]] = _nothing
         self._frame = struct.Struct("<IB3x8x")
         super().__init__(dictionary, TPDO_COMMUNICATION + number, TPDO_MAPPING + number, changed, sent=True)
 
     def _rebuild(self, _: int) -> None:
-        self.last = None
+        self._start = self._values[key_of(self._communication, 6)]
+        self.restart()
         super()._rebuild(_)
         size = self.codec.size
         if size > FRAME_DATA:
@@ -203,6 +218,19 @@ class Tpdo(Pdo):
 
     def _select_few(self, values: dict[int, Any]) -> tuple[Any, ...]:
         return tuple(values[key] for key in self.keys)
+
+    def restart(self) -> None:
+        """Begin anew: an event-driven PDO has never been sent, a cyclic one counts from the next SYNC."""
+        self.last = None
+        self._syncs = 0
+        self.waiting = bool(self._start and self._values[K_SYNC_COUNTER])
+
+    def count(self, counter: int) -> bool:
+        """Hear the counter of a SYNC. Returns whether this SYNC is the first one for a PDO that was waiting."""
+        begins = self.waiting and counter == self._start
+        if begins:
+            self.waiting = False
+        return begins
 
     def pack(self) -> bytes:
         """Frame of 16 bytes with the mapped objects as they are now."""

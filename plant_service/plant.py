@@ -6,110 +6,44 @@ The order of a cycle is `deliver` (commands, then SYNC, on every bus) → `truth
 from __future__ import annotations
 
 from functools import partial
-from typing import Protocol
+from typing import Final
 
-from hal.profile import frames, objects
+from hal.profile import objects
 from hal.profile.cia402 import SUPPORTED_MODES
-from hal.profile.identifiers import SYNC
+from hal.profile.frames import split
+from plant_service.bus_nodes import BusNodes, Device, TimedBus, UntimedBus, is_sync
 from plant_service.device import DriveDevice
 from plant_service.errors import PlantError
 from plant_service.object_dictionary import key_of
 from plant_service.sensor_device import ForceTorqueDevice, ImuDevice, Motion, Wrench
 from plant_service.simulation import Simulation
+from plant_service.wire import Wire
 from schemas.load import Run
-from schemas.messages import PlantTruth
+from schemas.messages import BusStatistics, PlantTruth
 from schemas.robot import Joint
 
 SENSORS_LAST = 128
 """After every node id."""
-
-
-class Device(Protocol):
-    """A node of a bus: pure, frames of 16 bytes out."""
-
-    @property
-    def revision(self) -> int:
-        """Grows when `can_ids` changes."""
-        ...
-
-    @property
-    def can_ids(self) -> frozenset[int]:
-        """Identifiers that it listens to."""
-        ...
-
-    def receive(self, can_id: int, data: bytes, now_ns: int) -> list[bytes]:
-        """Hear one frame."""
-        ...
-
-    def sync(self, now_ns: int) -> list[bytes]:
-        """Answer a SYNC without data."""
-        ...
-
-    def tick(self, now_ns: int) -> list[bytes]:
-        """Act on the time."""
-        ...
+VIRTUAL: Final = "cosim"
+"""Interface of the buses that the plant hosts."""
+STATISTICS_NS: Final = 1_000_000_000
 
 
 class SyncOrderError(PlantError):
     """A bus had its second SYNC before another had its first: the buses are not driven by one clock."""
 
 
-class BusNodes:
-    """The nodes of one bus and the way of frames to them."""
-
-    def __init__(self, devices: list[Device]) -> None:
-        self.devices = devices
-        self.waiting: list[bytes] = []
-        """Frames that arose while nobody listened (heartbeats, watchdog EMCY): sent with the next answer."""
-        self._routes: dict[int, list[Device]] = {}
-        self._revision = -1
-
-    def deliver(self, can_id: int, data: bytes, now_ns: int) -> list[bytes]:
-        """Give a frame to the nodes that listen; their answers."""
-        listeners = self._routes.get(can_id)
-        if listeners is None:
-            listeners = self._routes[can_id] = [device for device in self.devices if can_id in device.can_ids]
-        answers: list[bytes] = []
-        for device in listeners:
-            answers += device.receive(can_id, data, now_ns)
-        if answers:  # every service that can change what a node listens to is answered
-            revision = sum(device.revision for device in self.devices)
-            if revision != self._revision:
-                self._routes.clear()
-                self._revision = revision
-        return answers
-
-    def sync(self, now_ns: int) -> list[bytes]:
-        """Give a SYNC to all; their answers in the order of arbitration: lowest identifier first."""
-        answers: list[bytes] = []
-        for device in self.devices:
-            answers += device.sync(now_ns)
-        return answers
-
-    def tick(self, now_ns: int) -> None:
-        """Let the time act on all; what they say waits."""
-        for device in self.devices:
-            self.waiting += device.tick(now_ns)
-
-    def collect(self, answers: list[bytes]) -> bytes:
-        """Answers and waiting frames in the order of arbitration (a node's own frames keep their order)."""
-        if self.waiting:
-            answers = self.waiting + answers
-            self.waiting = []
-        answers = sorted(answers, key=frame_identifier)
-        return b"".join(answers)
-
-
-def frame_identifier(frame: bytes) -> int:
-    """Read the identifier of a packed 11-bit frame."""
-    return frame[1] << 8 | frame[0]
-
-
 class Plant:
     """Simulation and devices of a run. Time 0 is the first SYNC.
 
-    With `free`, time passes by `advance` alone and masters send SYNC when and on which bus they like: the order of a
-    cycle is then `advance` → `deliver`, as soon as the first SYNC of a sequence arrives.
+    In lockstep the frames of every bus take their time on a simulated wire (`TimedBus`), whatever carries them between
+    the processes: a SYNC is ready at the present time, commands when the slowest bus has answered and the compute
+    budget of the description has passed (of which a `command_delay_cycles` of 2 hides a period). What could not be on
+    the bus before the next SYNC is heard after it. Before a bus's first SYNC its frames take no time, as in the boot.
+
+    With `free`, time passes by `advance` alone and masters send when they like, at wall-clock times that the caller
+    gives as `after_ns`; the order of a cycle is then `advance` → `deliver`, as soon as the first SYNC of a sequence
+    arrives. Only virtual buses are timed then: a real one takes its own time.
     """
 
     def __init__(self, run: Run, *, free: bool = False) -> None:
@@ -119,11 +53,34 @@ class Plant:
             DriveDevice(joint.drive.node_id, axis, drive_defaults(joint))
             for joint, axis in zip(self._robot.joints, self.simulation.axes, strict=True)
         )
-        self._buses = [BusNodes(self._devices_of(bus.name)) for bus in self._robot.buses]
-        self._synced = [False] * len(self._buses)
+        nodes = [BusNodes(self._devices_of(bus.name)) for bus in self._robot.buses]
+        self._boot = [UntimedBus(each) for each in nodes]
+        """Each bus while its frames take no time."""
+        self._wires = [
+            TimedBus(each, Wire(bus.bitrate, self._robot.period_ns)) if not free or bus.interface == VIRTUAL else None
+            for each, bus in zip(nodes, self._robot.buses, strict=True)
+        ]
+        self._started = [False] * len(nodes)
+        """Each bus has had its first SYNC (lockstep)."""
+        self._synced = [False] * len(nodes)
+        self._down = [False] * len(nodes)
         self._now_ns = self.simulation.time_ns
         self._free = free
         self._origin_ns = 0
+        self._looked_ns = [self._now_ns] * len(nodes)
+        """Until when the frames of each bus have been looked at (`free`)."""
+        self._behind = [False] * len(nodes)
+        """Periods have been left out since the last frames of each bus (`free`)."""
+        self._sync_ns = 0
+        """Time of the present SYNC (lockstep)."""
+        self._last_command_ns = 0
+        """When the commands of the cycle before `advance` were ready (lockstep)."""
+        self._compute_ns = max(
+            0,
+            round(self._robot.compute_budget_s * 1e9) - (self._robot.command_delay_cycles - 1) * self._robot.period_ns,
+        )
+        """From the last report to the first RPDO."""
+        self._statistics_due_ns = STATISTICS_NS
         self.sequence = -1
         """Of the SYNC that came last on any bus, with `free` the periods since the first; −1 before the first."""
 
@@ -134,27 +91,64 @@ class Plant:
 
     @property
     def sync_complete(self) -> bool:
-        """Every bus has had the SYNC of the present sequence: the interval may be integrated."""
-        return all(self._synced)
+        """Every bus that is up has had the SYNC of the present sequence: the interval may be integrated."""
+        return any(self._synced) and all(synced or down for synced, down in zip(self._synced, self._down, strict=True))
 
-    def deliver(self, bus_index: int, packet: bytes) -> bytes:
-        """Give frames of a bus to its nodes; all their answers, those to a SYNC in the order of arbitration.
+    @property
+    def busy_ns(self) -> int | None:
+        """With `free`: the time until which frames wait on a simulated wire; None when none does."""
+        times = [wire.wire.busy_ns for wire in self._wires if wire is not None]
+        return max((time for time in times if time is not None), default=None)
+
+    def set_bus_down(self, index: int, down: bool) -> None:
+        """Take a bus away or bring it back: one that is down carries nothing and is not waited for."""
+        self._down[index] = down
+        if down:
+            for bus in (self._boot[index], self._wires[index]):
+                if bus is not None:
+                    bus.clear()
+
+    def deliver(self, bus_index: int, packet: bytes, after_ns: int = 0) -> bytes:
+        """Give frames of a bus to it; the frames of its nodes that were on the bus meanwhile.
+
+        Args:
+            bus_index: of the description's buses.
+            packet: n × 16 bytes.
+            after_ns: wall time since `time_ns` (`free` only). What comes before a SYNC in the packet was sent before
+                it, at a time that nobody saw: it counts from the last look at the bus.
 
         Raises:
             ProfileError: the packet is not a whole number of frames.
-            SyncOrderError: a second SYNC before the other buses' first.
+            SyncOrderError: a second SYNC before the other buses' first (lockstep); nothing has been delivered.
 
         """
-        bus = self._buses[bus_index]
-        now_ns = self._now_ns
-        answers: list[bytes] = []
-        for can_id, data in frames.unpack(packet):
-            if can_id == SYNC and not data:
-                self._count_sync(bus_index)
-                answers.append(bus.collect(bus.sync(now_ns)))
+        wire = self._wires[bus_index]
+        frames = split(packet)
+        syncs = sum(map(is_sync, frames))
+        if self._free:
+            return self._deliver_free(bus_index, packet, frames, syncs, after_ns)
+        assert wire is not None  # lockstep: all are timed
+        if syncs:
+            self._check_order(bus_index, syncs)
+        answers = []
+        for frame in frames:
+            if is_sync(frame):
+                answers.append(self._sync(bus_index, wire, frame))
+            elif not self._started[bus_index]:
+                answers.append(self._boot[bus_index].exchange(frame, self._now_ns))
             else:
-                answers += bus.deliver(can_id, data, now_ns)
+                wire.put(frame, self._command_ns if self._synced[bus_index] else self._last_command_ns)
+        if self._started[bus_index]:
+            answers.append(wire.run(self._next_sync_ns(bus_index) - 1, self._now_ns))
         return b"".join(answers)
+
+    def pump(self, after_ns: int) -> tuple[bytes, ...]:
+        """With `free`: the nodes' frames that the buses have carried by now, bus by bus."""
+        limits_ns = self._looked_ns = [max(self._now_ns + after_ns, looked) for looked in self._looked_ns]
+        return tuple(
+            b"" if wire is None else wire.run(limit_ns, self._now_ns)
+            for wire, limit_ns in zip(self._wires, limits_ns, strict=True)
+        )
 
     def truth(self) -> PlantTruth:
         """Report the robot as it really is at the present SYNC."""
@@ -165,16 +159,19 @@ class Plant:
 
     def advance(self) -> None:
         """Integrate one period, then let the time act on the devices; the next SYNC may come."""
+        if not self._free:
+            self._last_command_ns = self._command_ns
         self.simulation.advance()
         self._now_ns = now_ns = self.simulation.time_ns
-        for bus in self._buses:
-            bus.tick(now_ns)
-        self._synced = [False] * len(self._buses)
+        for boot, wire in zip(self._boot, self._wires, strict=True):
+            (boot if wire is None else wire).tick(now_ns)
+        self._synced = [False] * len(self._synced)
         if self._free and self.sequence >= 0:
             self.sequence += 1
 
     def skip(self, periods: int) -> None:
         """Leave out periods that there was no time to simulate (`free`): what follows keeps its place in time."""
+        self._behind = [True] * len(self._behind)
         if self.sequence >= 0:
             self.sequence += periods
             self._origin_ns -= periods * self._robot.period_ns
@@ -186,24 +183,75 @@ class Plant:
 
     def collect(self) -> tuple[bytes, ...]:
         """Take what the nodes of each bus said on their own since their last answer."""
-        return tuple(bus.collect([]) for bus in self._buses)
+        return tuple(
+            boot.collect() if wire is None else wire.run(self._now_ns, self._now_ns)
+            for boot, wire in zip(self._boot, self._wires, strict=True)
+        )
 
-    def _count_sync(self, bus_index: int) -> None:
-        if self._free:
-            if self.sequence < 0:
-                self.sequence, self._origin_ns = 0, self._now_ns
-            return
-        if self._synced[bus_index]:
-            missing = [bus.name for bus, synced in zip(self._robot.buses, self._synced, strict=True) if not synced] or [
-                "none: the plant was not advanced"
-            ]
-            raise SyncOrderError(
-                f"bus {self._robot.buses[bus_index].name}: second SYNC of sequence {self.sequence}; "
-                f"still without it: {', '.join(missing)}"
-            )
+    def statistics(self, *, final: bool = False) -> tuple[BusStatistics, ...]:
+        """Tell what came of the frames since the last time, a message a timed bus; empty before a second is over."""
+        now_ns = self._now_ns
+        if now_ns < self._statistics_due_ns and not final:
+            return ()
+        self._statistics_due_ns = now_ns + STATISTICS_NS
+        sequence, time_ns = max(self.sequence, 0), now_ns - self._origin_ns
+        messages = []
+        for bus, wire in zip(self._robot.buses, self._wires, strict=True):
+            if wire is not None:
+                messages.append(wire.wire.statistics.take(bus.name, sequence, time_ns, final=final))
+        return tuple(message for message in messages if message is not None)
+
+    @property
+    def _command_ns(self) -> int:
+        """When the commands that answer the present SYNC's reports are ready (lockstep)."""
+        return max(wire.answered_ns for wire in self._wires if wire is not None) + self._compute_ns
+
+    def _next_sync_ns(self, bus_index: int) -> int:
+        """When the next SYNC of a bus is due (lockstep), if it was not before; other buses may have had theirs."""
+        if any(self._synced) and not self._synced[bus_index]:
+            return self._sync_ns
+        return max(self._sync_ns + self._robot.period_ns, self._now_ns)
+
+    def _deliver_free(self, bus_index: int, packet: bytes, frames: list[bytes], syncs: int, after_ns: int) -> bytes:
+        if syncs and self.sequence < 0:
+            self.sequence, self._origin_ns = 0, self._now_ns
+        wire = self._wires[bus_index]
+        if wire is None:
+            return self._boot[bus_index].exchange(packet, self._now_ns)
+        looked_ns = self._looked_ns[bus_index]
+        ready_ns = self._looked_ns[bus_index] = max(self._now_ns + after_ns, looked_ns)
+        if syncs > 1 or self._behind[bus_index]:
+            # Read too late to tell when it was sent: charged as if it had come just now, it would not fit.
+            self._behind[bus_index] = False
+            return wire.run(ready_ns, self._now_ns) + self._boot[bus_index].exchange(packet, self._now_ns)
+        for frame in frames:
+            if is_sync(frame):
+                wire.begin(frame, ready_ns)
+                syncs -= 1
+            else:
+                wire.put(frame, looked_ns if syncs else ready_ns)
+        return wire.run(ready_ns, self._now_ns)
+
+    def _sync(self, bus_index: int, wire: TimedBus, frame: bytes) -> bytes:
+        """Let a bus finish what came before a SYNC, then the SYNC, the answers, and what fits until the commands."""
         if not any(self._synced):
             self.sequence += 1
-        self._synced[bus_index] = True
+            self._sync_ns = self._now_ns
+        self._synced[bus_index] = self._started[bus_index] = True
+        now_ns = self._now_ns
+        last_ns = self._sync_ns + self._robot.period_ns - 1
+        before = wire.run(self._sync_ns - 1, now_ns)
+        answers = wire.sync(frame, self._sync_ns, last_ns, now_ns)
+        return before + answers + wire.run(min(wire.answered_ns + self._compute_ns, last_ns), now_ns)
+
+    def _check_order(self, bus_index: int, syncs: int) -> None:
+        if not self._synced[bus_index] and syncs == 1:
+            return
+        missing = [bus.name for bus, synced in zip(self._robot.buses, self._synced, strict=True) if not synced]
+        raise SyncOrderError(
+            f"bus {self._robot.buses[bus_index].name}: second SYNC of sequence {max(self.sequence, 0)}; "
+            f"still without it: {', '.join(missing) or 'none: the plant was not advanced'}"
+        )
 
     def _devices_of(self, bus: str) -> list[Device]:
         robot = self._robot

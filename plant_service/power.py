@@ -1,5 +1,8 @@
 """CiA 402 on the drive's side: power state machine, modes, set-points, stops, and the hold of a drive left alone.
 
+The controlword counts by its level: a word sent again in another state is taken again; only bit 7 counts by its edge.
+All ramps of the option codes are one and the same: the firmware brings the axis to rest as fast as its torque allows.
+
 The axis gives torque in Operation Enabled only, and while Quick Stop Active or Fault Reaction Active bring it to rest;
 in every other state the power stage is off and the brake holds.
 
@@ -13,33 +16,9 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from hal.profile.cia402 import (
-    FAULT_RESET_BIT,
-    HALT_BIT,
-    DisableOperationOption,
-    FaultReactionOption,
-    OperationMode,
-    QuickStopOption,
-    StatusBit,
-    encode_statusword,
-    next_state,
-)
-from hal.profile.objects import (
-    CONTROLWORD,
-    DISABLE_OPERATION_OPTION,
-    FAULT_REACTION_OPTION,
-    FOLLOWING_ERROR_WINDOW,
-    MAX_TORQUE,
-    MODE,
-    MODE_DISPLAY,
-    QUICK_STOP_OPTION,
-    SHUTDOWN_OPTION,
-    SOFTWARE_POSITION_LIMIT,
-    TARGET_POSITION,
-    TARGET_TORQUE,
-    TORQUE_ACTUAL,
-    VELOCITY_ACTUAL,
-)
+from hal.profile import objects
+from hal.profile.cia402 import HALT_BIT, OperationMode, StatusBit, encode_statusword, next_state
+from hal.profile.stop_options import DisableOperationOption, FaultReactionOption, QuickStopOption
 from plant_service.axis import Axis
 from plant_service.object_dictionary import key_of
 from schemas.messages import DriveState
@@ -50,20 +29,27 @@ LONGEST_STOP_NS: Final = 1_000_000_000
 """A ramp ends after this even if the axis still moves: the brake takes over."""
 WINDOW_OFF: Final = (0, 0xFFFF_FFFF)
 
-K_CONTROLWORD, K_MODE, K_DISPLAY = key_of(CONTROLWORD), key_of(MODE), key_of(MODE_DISPLAY)
-K_POSITION, K_TORQUE, K_MAX_TORQUE = key_of(TARGET_POSITION), key_of(TARGET_TORQUE), key_of(MAX_TORQUE)
-K_TORQUE_ACTUAL, K_WINDOW = key_of(TORQUE_ACTUAL), key_of(FOLLOWING_ERROR_WINDOW)
-K_VELOCITY = key_of(VELOCITY_ACTUAL)
-K_LOWEST, K_HIGHEST = key_of(SOFTWARE_POSITION_LIMIT, 1), key_of(SOFTWARE_POSITION_LIMIT, 2)
-STAY_OPTIONS: Final = (5, 6, 7, 8)
+K_CONTROLWORD, K_MODE, K_DISPLAY = map(key_of, (objects.CONTROLWORD, objects.MODE, objects.MODE_DISPLAY))
+K_POSITION, K_TORQUE, K_MAX_TORQUE = map(key_of, (objects.TARGET_POSITION, objects.TARGET_TORQUE, objects.MAX_TORQUE))
+K_VELOCITY, K_TORQUE_ACTUAL = key_of(objects.VELOCITY_ACTUAL), key_of(objects.TORQUE_ACTUAL)
+K_WINDOW = key_of(objects.FOLLOWING_ERROR_WINDOW)
+K_LOWEST, K_HIGHEST = (key_of(objects.SOFTWARE_POSITION_LIMIT, subindex) for subindex in (1, 2))
+K_QUICK_STOP, K_FAULT_REACTION = key_of(objects.QUICK_STOP_OPTION), key_of(objects.FAULT_REACTION_OPTION)
+K_SHUTDOWN, K_DISABLE_OPERATION = key_of(objects.SHUTDOWN_OPTION), key_of(objects.DISABLE_OPERATION_OPTION)
+STAY_OPTIONS: Final = (5, 6, 7)
+"""Values of 0x605A with which the drive stays in Quick Stop Active."""
 
 _S = DriveState
-STATUS_OF_STATE: Final = {state: int(encode_statusword(state, StatusBit.VOLTAGE_ENABLED)) for state in DriveState}
-FOLLOWS, LIMITED, WARNING = (
-    int(bit) for bit in (StatusBit.FOLLOWS_COMMAND, StatusBit.INTERNAL_LIMIT, StatusBit.WARNING)
-)
+STATUS_OF_STATE: Final = {
+    state: int(encode_statusword(state, StatusBit.VOLTAGE_ENABLED | StatusBit.REMOTE)) for state in DriveState
+}
+"""The power supply is always on, and the controlword is always obeyed, by SDO as well as by PDO."""
+FOLLOWS, LIMITED = int(StatusBit.FOLLOWS_COMMAND), int(StatusBit.INTERNAL_LIMIT)
+WARNING, REACHED, LAGS = map(int, (StatusBit.WARNING, StatusBit.TARGET_REACHED, StatusBit.FOLLOWING_ERROR))
 OPERATION_ENABLED: Final = DriveState.OPERATION_ENABLED
 CST: Final = int(OperationMode.CST)
+SET_POINT: Final = {int(OperationMode.CSP): K_POSITION, CST: K_TORQUE}
+"""Object that commands the axis in each mode."""
 STOPPING: Final = (_S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE)
 
 
@@ -80,16 +66,18 @@ class Power:
         """The watchdog latch."""
         self.halted = False
         self._word = 0
+        self._judged_in = self.state
+        """State that `_word` led to, or stayed in."""
         self._fresh = False
         """A set-point of the present mode arrived since it may be followed."""
         self._follows = False
         self._limited = False
+        self._following_error = False
         self._ramp_to: DriveState | None = None
         """State to take with the power off once the axis stands."""
         self._ramp_end_ns: int | None = None
         self._counts = axis.position_counts()
-        self._counts_ns = 0
-        self._moved = 0
+        self._counts_ns = self._moved = 0
         axis.power_off()
 
     def reset(self) -> None:
@@ -130,12 +118,11 @@ class Power:
         reset = False
         if K_CONTROLWORD in keys:
             word = values[K_CONTROLWORD]
-            if word != self._word:
+            if word != self._word or self.state is not self._judged_in:
                 reset = self._command(word, can_reset=can_reset)
-        if before is _S.OPERATION_ENABLED and not self.left_alone:
-            wanted = K_POSITION if self.mode == OperationMode.CSP else K_TORQUE
-            if wanted in keys:
-                self._fresh = True
+                self._judged_in = self.state
+        if before is _S.OPERATION_ENABLED and not self.left_alone and SET_POINT.get(self.mode) in keys:
+            self._fresh = True
         if mode_changed and not self._fresh and self.state is _S.OPERATION_ENABLED and self._ramp_to is None:
             self._hold()
         return reset
@@ -161,6 +148,7 @@ class Power:
             target = values[K_POSITION]
             window = values[K_WINDOW]
             if window not in WINDOW_OFF and self._follows and abs(target - self._axis.position_counts()) > window:
+                self._following_error = True
                 return True
             allowed = min(max(target, values[K_LOWEST]), values[K_HIGHEST])
             self._axis.follow_position(allowed, limit)
@@ -192,7 +180,7 @@ class Power:
         if self.state in (_S.FAULT, _S.FAULT_REACTION_ACTIVE):
             return
         powered = self.state in (_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE)
-        option = self._values[key_of(FAULT_REACTION_OPTION)]
+        option = self._values[K_FAULT_REACTION]
         if powered and option != FaultReactionOption.DISABLE:
             self.state = _S.FAULT_REACTION_ACTIVE
             self._ramp(_S.FAULT)
@@ -215,14 +203,20 @@ class Power:
             self._switch_off(self._ramp_to)
 
     def statusword(self) -> int:
-        """Object 0x6041, without the remote bit, which belongs to the communication."""
+        """Object 0x6041.
+
+        Bit 10 says that the axis stands after a halt or a quick stop that stays; in modes 8 and 10 it has no other use.
+        """
         word = STATUS_OF_STATE[self.state]
         if self._follows:
-            word |= FOLLOWS
-        if self._limited:
-            word |= LIMITED
+            return word | FOLLOWS | LIMITED if self._limited else word | FOLLOWS
         if self.left_alone:
             word |= WARNING
+        if self._following_error:
+            word |= LAGS
+        stopped = self.halted if self.state is _S.OPERATION_ENABLED else self.state is _S.QUICK_STOP_ACTIVE
+        if stopped and self._ramp_to is None and abs(self._moved) <= STANDSTILL_COUNTS:
+            word |= REACHED
         return word
 
     def _change_mode(self, mode: int) -> bool:
@@ -233,11 +227,10 @@ class Power:
         return True
 
     def _command(self, word: int, *, can_reset: bool) -> bool:
-        edge = word & FAULT_RESET_BIT and not self._word & FAULT_RESET_BIT
-        if edge and self.state is _S.FAULT and not can_reset:
+        if self.state is _S.FAULT and not can_reset:
             self._word = word
             return False
-        option = self._values[key_of(QUICK_STOP_OPTION)]
+        option = self._values[K_QUICK_STOP]
         target = next_state(self.state, word, self._word, leave_quick_stop=option in STAY_OPTIONS)
         before, self._word = self.state, word
         if target is before:
@@ -251,8 +244,8 @@ class Power:
         elif target is _S.QUICK_STOP_ACTIVE:
             self._quick_stop()
         elif before is _S.OPERATION_ENABLED and target is not _S.SWITCH_ON_DISABLED:
-            ramp = DISABLE_OPERATION_OPTION if target is _S.SWITCHED_ON else SHUTDOWN_OPTION
-            if self._values[key_of(ramp)] == DisableOperationOption.DISABLE:
+            option = self._values[K_DISABLE_OPERATION if target is _S.SWITCHED_ON else K_SHUTDOWN]
+            if option == DisableOperationOption.DISABLE:
                 self._switch_off(target)
             else:
                 self._ramp(target)
@@ -269,7 +262,7 @@ class Power:
         self._hold()
 
     def _quick_stop(self) -> None:
-        option = self._values[key_of(QUICK_STOP_OPTION)]
+        option = self._values[K_QUICK_STOP]
         self.left_alone = False
         if option == QuickStopOption.DISABLE:
             self._switch_off(_S.SWITCH_ON_DISABLED)
@@ -284,8 +277,7 @@ class Power:
     def _ramp(self, target: DriveState) -> None:
         self._hold()
         self._ramp_to, self._ramp_end_ns = target, None
-        at_rest = abs(self._moved) <= STANDSTILL_COUNTS
-        if at_rest and self.state not in STOPPING:
+        if abs(self._moved) <= STANDSTILL_COUNTS and self.state not in STOPPING:
             self._switch_off(target)
 
     def _hold(self) -> None:
@@ -296,4 +288,5 @@ class Power:
         self.state = state
         self._axis.power_off()
         self.left_alone = self._fresh = self._follows = self._limited = self.halted = False
+        self._following_error = self._following_error and state is _S.FAULT
         self._ramp_to = self._ramp_end_ns = None

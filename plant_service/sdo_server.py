@@ -1,7 +1,8 @@
 """SDO server: expedited and segmented transfers between a master and one device's object dictionary.
 
 CiA 301 section 7.2.4. A request and its answer are 8 bytes; byte 0 is the command, 1-3 the address (little endian).
-A block upload is answered by an ordinary upload, as the standard allows; a block download is refused.
+Block transfers are refused. A block upload is answered by an ordinary upload where the client allows that by its
+protocol switch threshold.
 """
 
 from __future__ import annotations
@@ -62,12 +63,19 @@ class SdoServer:
             self._transfer = None
             if specifier == DOWNLOAD:
                 return self._download(command, index, subindex, data)
-            if specifier in (UPLOAD, BLOCK_UPLOAD) and not (specifier == BLOCK_UPLOAD and command & 3):
+            if specifier == UPLOAD:
                 return self._upload(index, subindex)
+            if specifier == BLOCK_UPLOAD and not command & 3:
+                return self._block_upload(index, subindex, data[5])
             raise SdoAbort(AbortCode.UNKNOWN_COMMAND, index, subindex)
         except SdoAbort as abort:
             self._transfer = None
             return ADDRESS.pack(0x80, abort.index, abort.subindex) + struct.pack("<I", abort.code)
+
+    def _block_upload(self, index: int, subindex: int, threshold: int) -> bytes:
+        if len(self.dictionary.read(index, subindex)) > threshold:
+            raise SdoAbort(AbortCode.UNKNOWN_COMMAND, index, subindex)
+        return self._upload(index, subindex)
 
     def _upload(self, index: int, subindex: int) -> bytes:
         value = self.dictionary.read(index, subindex)

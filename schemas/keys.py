@@ -61,6 +61,10 @@ class Keys:
         """BusFrames of one bus, written by the HAL."""
         return f"{self.root}/bus/{name}"
 
+    def load(self, name: str) -> str:
+        """BusStatistics of one bus, written by the plant."""
+        return f"{self.root}/load/{name}"
+
     def alive(self, service: str) -> str:
         """Liveliness token: the service runs and has declared its subscriptions."""
         return f"{self.root}/alive/{service}"

@@ -13,7 +13,10 @@ from schemas.topics import decode
 from schemas.transport import PeerLostError, Transport
 
 JOIN_TIMEOUT_S: Final = 60.0
-"""Patience with peers that are still starting: imports alone take seconds on a slow machine."""
+"""Patience with peers that are still starting."""
+JOIN_PER_START: Final = 20.0
+"""The same as a multiple of the processor time that this service took to start: on an emulated processor imports alone
+take a minute."""
 FAREWELL_S: Final = 0.1
 """A peer's last word may arrive this long after its token has gone."""
 STOPPED: Final = "service_stopped"
@@ -45,7 +48,8 @@ class Lifecycle:
             JoinCancelledError: a signal came first.
 
         """
-        self.transport.join(peers, JOIN_TIMEOUT_S, cancelled=lambda: self.signalled is not None)
+        timeout_s = max(JOIN_TIMEOUT_S, JOIN_PER_START * time.process_time())
+        self.transport.join(peers, timeout_s, cancelled=lambda: self.signalled is not None)
 
     def stamp(self, sequence: int, time_ns: int) -> None:
         """Set the sequence and time that events carry from now on."""

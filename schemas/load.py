@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from schemas.bus_load import bus_loads
+from schemas.bus_load import cycle_plan
 from schemas.errors import ConfigurationError
 from schemas.robot import RobotDescription
 from schemas.scenario import Scenario
@@ -51,6 +52,8 @@ def load_run(scenario: str, overrides: dict[str, Any] | None = None) -> Run:
     `overrides` maps dotted paths to values, e.g. `{"plant.torque_scale": 0.8, "robot.rate_hz": 250}`: paths that start
     with `robot.` reach the robot description, others the scenario.
 
+    A robot whose buses cannot carry its plan is refused unless the scenario says `allow_overload`.
+
     Raises:
         ConfigurationError: with file, field and reason.
 
@@ -62,16 +65,20 @@ def load_run(scenario: str, overrides: dict[str, Any] | None = None) -> Run:
         split[of_robot][key.removeprefix("robot.")] = value
     config = _parse(Scenario, _override(_read_yaml(path), split[False], path), path)
     beside = path.parent / config.robot
-    robot = load_robot(str(beside) if beside.is_file() else config.robot, split[True])
+    name = str(beside) if beside.is_file() else config.robot
+    robot = load_robot(name, split[True], allow_overload=config.allow_overload)
     check_run(robot.description, config, path)
     return Run(robot, config)
 
 
-def load_robot(robot: str, overrides: dict[str, Any] | None = None) -> Robot:
+def load_robot(robot: str, overrides: dict[str, Any] | None = None, *, allow_overload: bool = False) -> Robot:
     """Read and check a robot description (a packaged name or a path) and its URDF.
 
+    `allow_overload` takes one whose buses cannot carry its plan.
+
     Raises:
-        ConfigurationError: unknown field, NaN, duplicate node id, joint missing in the URDF, bus over 100 %, …
+        ConfigurationError: unknown field, NaN, duplicate node id, joint missing in the URDF, bus over 100 %, commands
+            that would miss their SYNC, …
 
     """
     path = _find(robot, "robots", "robot")
@@ -79,13 +86,23 @@ def load_robot(robot: str, overrides: dict[str, Any] | None = None) -> Robot:
     urdf_path = resolve_urdf(description.urdf, path)
     urdf = urdf_path.read_text(encoding="utf-8")
     _check_urdf(description, urdf, path, urdf_path)
-    for load in bus_loads(description):
-        if load.fraction > 1.0:
-            raise ConfigurationError(
-                f"{path}: bus {load.bus} is overloaded: {load.explain()}."
-                " Lower rate_hz, move joints to another bus, or add a bus."
-            )
+    if not allow_overload:
+        _check_plan(description, path)
     return Robot(description, urdf)
+
+
+def rewire(robot: Robot, lines: Sequence[dict[str, Any]]) -> Robot:
+    """Put a robot on other wires: `lines` holds new values of fields of `schemas.robot.BUS_LINES`, one entry a bus.
+
+    Raises:
+        ConfigurationError: a channel given twice, an empty one, two channels for a virtual bus.
+
+    """
+    buses = [bus.model_dump() | line for bus, line in zip(robot.description.buses, lines, strict=True)]
+    try:
+        return Robot(RobotDescription.model_validate(dict(robot.description) | {"buses": buses}), robot.urdf)
+    except ValidationError as error:
+        raise ConfigurationError(_faults(error, "buses")) from error
 
 
 def resolve_urdf(urdf: str, robot_file: Path) -> Path:
@@ -234,12 +251,27 @@ def _parse(model: type[M], data: dict[str, Any], path: Path) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        faults = []
-        for fault in error.errors():
-            field = ".".join(str(part) for part in fault["loc"]) or model.__name__
-            faults.append(f"{field}: {fault['msg'].removeprefix('Value error, ')}")
-        more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
-        raise ConfigurationError(f"{path}: {'; '.join(faults[:3])}{more}") from error
+        raise ConfigurationError(f"{path}: {_faults(error, model.__name__)}") from error
+
+
+def _faults(error: ValidationError, whole: str) -> str:
+    """Field and reason of the first three faults; `whole` names what has no field."""
+    faults = []
+    for fault in error.errors():
+        field = ".".join(str(part) for part in fault["loc"]) or whole
+        faults.append(f"{field}: {fault['msg'].removeprefix('Value error, ')}")
+    more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
+    return f"{'; '.join(faults[:3])}{more}"
+
+
+def _check_plan(robot: RobotDescription, path: Path) -> None:
+    """Refuse a robot whose buses cannot carry its plan."""
+    plan = cycle_plan(robot)
+    if not plan.fits:
+        raise ConfigurationError(
+            f"{path}: {'; '.join(plan.faults())}. To make it fit: {plan.remedies()}; to run it all the same:"
+            " --allow-overload, or allow_overload: true in the scenario."
+        )
 
 
 def _check_urdf(robot: RobotDescription, urdf: str, path: Path, urdf_path: Path) -> None:

@@ -27,10 +27,9 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from schemas.base import Model
 from schemas.errors import CosimError
 from schemas.load import Robot, Run
-from schemas.messages import BusFrames
 from schemas.robot import RobotDescription
 from schemas.scenario import Scenario
-from schemas.topics import BUS_PREFIX, TOPICS, MalformedMessageError, decode, encode, stamp, topics_of
+from schemas.topics import MalformedMessageError, decode, encode, stamp, topics_of
 
 M = TypeVar("M", bound=Model)
 
@@ -211,13 +210,11 @@ class LogReader:
                     yield LogRecord(topic, item.sequence, item.log_time, item.data)
 
     def messages(self, model: type[M], *, bus: str | None = None) -> Iterator[M]:
-        """All messages of one kind in the order of writing; `bus` picks one bus of `BusFrames`."""
-        if model is BusFrames:
-            wanted = tuple(
-                BUS_PREFIX + each.name for each in self.run.robot.description.buses if bus in (None, each.name)
-            )
-        else:
-            wanted = tuple(topic for topic, each in TOPICS.items() if each is model)
+        """All messages of one kind in the order of writing; `bus` picks one of what has a topic a bus."""
+        topics = topics_of(self.run.robot.description)
+        wanted = tuple(
+            topic for topic, each in topics.items() if each is model and (bus is None or topic.endswith(f"/{bus}"))
+        )
         for record in self.records(wanted):
             try:
                 yield decode(model, record.data)

@@ -191,6 +191,43 @@ class BusFrames(Model):
     received: bytes
 
 
+class FrameStatistics(Model):
+    """What became of the frames of one identifier."""
+
+    can_id: int
+    frames: int
+    """Frames that were transmitted."""
+    late: int = 0
+    """Of these, commands that were on the bus only after the SYNC that was to latch them."""
+    replaced: int = 0
+    """Frames never transmitted: a newer one of the same sender and identifier took their place in the mailbox."""
+    wait_mean_s: float = 0.0
+    """From the moment a frame was ready to the start of its transmission."""
+    wait_max_s: float = 0.0
+
+
+class BusStatistics(Model):
+    """Timing of one bus since the last message; on `…/load/<bus>`, by the plant, in the bus's own (simulated) time.
+
+    A cycle begins at the time of its SYNC. Times of completion count from there and may exceed the period.
+    """
+
+    sequence: int
+    time_ns: int
+    bus: str
+    cycles: int
+    load_mean: float
+    """Share of the time in which the bus was taken, interframe spaces included."""
+    load_max: float
+    """Of the busiest cycle."""
+    report_end_max_s: float
+    """Latest end of an answer to a SYNC."""
+    command_end_max_s: float
+    """Latest end of a command."""
+    frames: tuple[FrameStatistics, ...]
+    """In the order of the identifiers."""
+
+
 class Event(Model):
     """Something that happened once: a mode change, a fault, a refusal, an operator's action; on `…/event`."""
 

@@ -16,18 +16,43 @@ NODE_IDENTIFIERS = (0x080, 0x180, 0x280, 0x200, 0x300, 0x580, 0x600, 0x700)
 IMU_IDENTIFIERS = (0x21, 0x32, 0x34)
 """The maker's, of quaternion, gyro and acceleration."""
 
+VIRTUAL_INTERFACE = "cosim"
+"""The project's own python-can interface: a bus in user space."""
+BUS_LINES = frozenset({"interface", "channel", "plant_channel", "bitrate"})
+"""Fields of `Bus` that name the wire."""
+
 NonNegative = Annotated[float, Field(ge=0.0)]
 
 
 class Bus(Model):
-    """One CAN bus, opened by python-can as `can.Bus(interface=…, channel=…, bitrate=…)`."""
+    """One CAN bus, opened by python-can as `can.Bus(interface=…, channel=…, bitrate=…)`.
+
+    All but the name are the bus lines: they say which wire a run is made on and change none of its messages.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     """Part of a Zenoh key and of a log's topic."""
-    interface: str = "cosim"
-    channel: str
+    interface: Annotated[str, Field(min_length=1)] = VIRTUAL_INTERFACE
+    channel: Annotated[str, Field(min_length=1)]
     """For `cosim` a socket path; a bare name lies in the run directory. For `socketcan` the interface's name."""
+    plant_channel: Annotated[str, Field(min_length=1)] | None = None
+    """The simulated robot's own channel where the HAL's is not its, e.g. the other one of two CAN cards on one wire."""
     bitrate: PositiveInt = 1_000_000
+
+    def of_plant(self) -> Bus:
+        """Give the bus as the simulated robot opens it."""
+        if self.plant_channel is None:
+            return self
+        return self.model_copy(update={"channel": self.plant_channel, "plant_channel": None})
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.plant_channel is not None and self.interface == VIRTUAL_INTERFACE:
+            raise ValueError(
+                f"plant_channel {self.plant_channel!r}: a virtual bus ({VIRTUAL_INTERFACE}) has one channel for all;"
+                " name the interface, e.g. socketcan, or leave plant_channel out"
+            )
+        return self
 
 
 class Drive(Model):
@@ -135,8 +160,11 @@ class Safety(Model):
     holding: Literal["rule", "none"] = "rule"
     """`none` sets a commanded change from torque to position to the bare commanded position: the naive switch, for
     comparison in simulation only; the robot jumps. A safe stop follows the rule all the same."""
-    heartbeat_s: PositiveFloat = 0.1
-    """Producer heartbeat of every node and of the HAL; three missing are a loss."""
+    heartbeat_s: Annotated[float, Field(ge=0.001, le=21.0)] = 0.1
+    """Producer heartbeat of every node and of the HAL; three missing are a loss. Objects 0x1016 and 0x1017 hold whole
+    milliseconds in 16 bits, and the loss is three of these."""
+    bus_recovery_s: PositiveFloat = 10.0
+    """Wall-clock patience of a safe stop with a bus that is down: the HAL holds the other buses and waits for it."""
 
 
 class RobotDescription(Model):
@@ -185,7 +213,8 @@ class RobotDescription(Model):
     @model_validator(mode="after")
     def _check(self) -> Self:
         _refuse_twice("bus", [bus.name for bus in self.buses])
-        _refuse_twice("bus channel", [f"{bus.interface}:{bus.channel}" for bus in self.buses])
+        channels = [(bus.interface, {bus.channel, bus.of_plant().channel}) for bus in self.buses]
+        _refuse_twice("bus channel", [f"{interface}:{name}" for interface, names in channels for name in sorted(names)])
         _refuse_twice("joint", [joint.name for joint in self.joints])
         sensors: tuple[ForceTorqueSensor | Imu, ...] = (*self.force_torque_sensors, *self.imus)
         _refuse_twice("sensor", [sensor.name for sensor in sensors])

@@ -75,5 +75,7 @@ class Scenario(Model):
     seed: Annotated[int, Field(ge=0)] = 0
     namespace: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = "cosim"
     """First part of all Zenoh keys."""
+    allow_overload: bool = False
+    """Run although the robot's buses cannot carry the plan (`schemas.bus_load`): frames are late or never sent."""
     plant: PlantConfig = PlantConfig()
     controller: ControllerConfig

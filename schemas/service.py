@@ -8,6 +8,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from schemas.load import Run
+from schemas.robot import BUS_LINES
 
 
 class Service(StrEnum):
@@ -36,9 +37,13 @@ class ServiceOptions:
 
 
 def session_identity(run: Run) -> str:
-    """Identity of a run: 12 hexadecimal digits that depend on robot, scenario and seed alone, so that logs repeat."""
+    """Identity of a run: 12 hexadecimal digits that depend on robot, scenario and seed alone, so that logs repeat.
+
+    The bus lines do not count: it is the same run on another wire, and only who opens a bus must know which.
+    """
+    robot = run.robot.description
     digest = hashlib.sha256()
-    digest.update(run.robot.description.model_dump_json(by_alias=True).encode())
+    digest.update(robot.model_dump_json(by_alias=True, exclude={"buses": {"__all__": set(BUS_LINES)}}).encode())
     digest.update(run.robot.urdf.encode())
     digest.update(run.scenario.model_dump_json(by_alias=True).encode())
     return digest.hexdigest()[:12]

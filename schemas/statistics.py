@@ -1,4 +1,4 @@
-"""Wall-clock figures of a service's cycles, summed up once a second."""
+"""Wall-clock figures of a service's cycles, summed up once a second; summaries of buses put together."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from schemas.messages import CycleStatistics
+from schemas.messages import BusStatistics, CycleStatistics, FrameStatistics
 
 INTERVAL_S: Final = 1.0
 BINS_PER_DECADE: Final = 100
@@ -76,3 +76,47 @@ def percentile(statistics: Iterable[CycleStatistics], q: float) -> float | None:
         if seen >= needed:
             return float(10.0 ** ((number + 1) / BINS_PER_DECADE) * 1e-6)
     return None
+
+
+def merge(statistics: Iterable[BusStatistics]) -> BusStatistics:
+    """One summary of several of the same bus, as if they were one: counts add up, means are weighted, maxima kept.
+
+    It bears sequence and time of the last. Loads are weighted by cycles, waits by frames.
+
+    Raises:
+        ValueError: no summary, or those of different buses.
+
+    """
+    parts = list(statistics)
+    if len({part.bus for part in parts}) != 1:
+        named = ", ".join(sorted({part.bus for part in parts})) or "none"
+        raise ValueError(f"summaries of one bus are wanted, at least one; given are those of: {named}")
+    cycles = sum(part.cycles for part in parts)
+    frames: dict[int, list[FrameStatistics]] = {}
+    for part in parts:
+        for each in part.frames:
+            frames.setdefault(each.can_id, []).append(each)
+    last = max(parts, key=lambda part: (part.sequence, part.time_ns))
+    return BusStatistics(
+        sequence=last.sequence,
+        time_ns=last.time_ns,
+        bus=last.bus,
+        cycles=cycles,
+        load_mean=sum(part.load_mean * part.cycles for part in parts) / max(cycles, 1),
+        load_max=max(part.load_max for part in parts),
+        report_end_max_s=max(part.report_end_max_s for part in parts),
+        command_end_max_s=max(part.command_end_max_s for part in parts),
+        frames=tuple(_merge_frames(can_id, frames[can_id]) for can_id in sorted(frames)),
+    )
+
+
+def _merge_frames(can_id: int, parts: list[FrameStatistics]) -> FrameStatistics:
+    count = sum(part.frames for part in parts)
+    return FrameStatistics(
+        can_id=can_id,
+        frames=count,
+        late=sum(part.late for part in parts),
+        replaced=sum(part.replaced for part in parts),
+        wait_mean_s=sum(part.wait_mean_s * part.frames for part in parts) / max(count, 1),
+        wait_max_s=max(part.wait_max_s for part in parts),
+    )

@@ -10,6 +10,7 @@ from schemas.base import Model
 from schemas.errors import CosimError
 from schemas.messages import (
     BusFrames,
+    BusStatistics,
     ControllerTrace,
     CycleStatistics,
     Event,
@@ -23,6 +24,7 @@ from schemas.robot import RobotDescription
 M = TypeVar("M", bound=Model)
 
 BUS_PREFIX = "bus/"
+LOAD_PREFIX = "load/"
 TOPICS: dict[str, type[Model]] = {
     "state": RobotState,
     "command": JointCommand,
@@ -32,7 +34,8 @@ TOPICS: dict[str, type[Model]] = {
     "health": CycleStatistics,
     "operator": OperatorRequest,
 }
-"""Leaf of a key (see `Keys`) and the message it carries; `bus/<name>` carries `BusFrames`."""
+"""Leaf of a key (see `Keys`) and the message it carries; `bus/<name>` carries `BusFrames`, `load/<name>` carries
+`BusStatistics`."""
 
 
 class MalformedMessageError(CosimError):
@@ -42,7 +45,8 @@ class MalformedMessageError(CosimError):
 def topics_of(robot: RobotDescription) -> dict[str, type[Model]]:
     """Every topic of a robot and its message, in the fixed order of a log's channels."""
     buses: dict[str, type[Model]] = {BUS_PREFIX + bus.name: BusFrames for bus in robot.buses}
-    return TOPICS | buses
+    loads: dict[str, type[Model]] = {LOAD_PREFIX + bus.name: BusStatistics for bus in robot.buses}
+    return TOPICS | buses | loads
 
 
 def encode(message: Model) -> bytes:

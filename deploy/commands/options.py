@@ -23,7 +23,20 @@ Bus = Annotated[
     typer.Option(
         metavar="A,B,C",
         help="Channels of the robot's buses, in order: `can0`, `vcan0` (SocketCAN), a path or name (virtual),"
-        " or INTERFACE:CHANNEL for any python-can interface.",
+        " or INTERFACE:CHANNEL for any python-can interface. HAL and plant may be told different ends of one wire.",
+    ),
+]
+PlantBus = Annotated[
+    str | None,
+    typer.Option(
+        metavar="A,B,C",
+        help="The plant's own channels where they are not the HAL's, e.g. the other one of two CAN cards on each wire.",
+    ),
+]
+AllowOverload = Annotated[
+    bool,
+    typer.Option(
+        "--allow-overload", help="Run although the buses cannot carry the plan; the summary says what is lost."
     ),
 ]
 BasePort = Annotated[
@@ -41,7 +54,7 @@ def overrides(
     seed: int | None = None,
     duration_s: float | None = None,
     clock: str | None = None,
-    bus: str | None = None,
+    allow_overload: bool = False,
 ) -> dict[str, Any]:
     """Dotted paths and values as `schemas.load.load_run` takes them; the later options win over `--set`.
 
@@ -68,10 +81,8 @@ def overrides(
         result["duration_s"] = duration_s
     if clock is not None:
         result["clock"] = clock
-    for index, channel in enumerate(bus.split(",") if bus else ()):
-        interface, name = bus_channel(channel)
-        result[f"robot.buses.{index}.interface"] = interface
-        result[f"robot.buses.{index}.channel"] = name
+    if allow_overload:
+        result["allow_overload"] = True
     return result
 
 
@@ -85,20 +96,51 @@ def bus_channel(text: str) -> tuple[str, str]:
     return ("socketcan" if is_kernel else "cosim"), name
 
 
-def check_buses(robot: RobotDescription, bus: str | None) -> None:
-    """Refuse a `--bus` that leaves a bus unnamed.
+def bus_lines(robot: RobotDescription, bus: str | None, plant_bus: str | None) -> list[dict[str, Any]]:
+    """Bus lines, as `schemas.load.rewire` takes them, of `--bus` (for HAL and plant) and `--plant-bus`.
 
     Raises:
-        UsageError: fewer channels than the robot has buses.
+        UsageError: not one channel a bus, or the two sides of a bus are of different interfaces.
 
     """
     from deploy.errors import UsageError
+    from schemas.robot import VIRTUAL_INTERFACE
 
-    if bus is not None and len(bus.split(",")) != len(robot.buses):
+    lines: list[dict[str, Any]] = [{} for _ in robot.buses]
+    if bus is not None:
+        for line, (interface, channel) in zip(lines, _channels(robot, "--bus", bus), strict=True):
+            line |= {"interface": interface, "channel": channel, "plant_channel": None}
+    if plant_bus is not None:
+        sides = _channels(robot, "--plant-bus", plant_bus)
+        for line, each, (interface, channel) in zip(lines, robot.buses, sides, strict=True):
+            of_hal = line.get("interface", each.interface)
+            if of_hal == VIRTUAL_INTERFACE:
+                raise UsageError(
+                    f"--plant-bus {plant_bus}: bus {each.name} is virtual, with one channel for HAL and plant; name the"
+                    " HAL's side of real buses by --bus"
+                )
+            if interface != of_hal:
+                raise UsageError(
+                    f"--plant-bus {plant_bus}: {channel} is of interface {interface}, but bus {each.name} is opened by"
+                    f" {of_hal}; both sides have the same interface"
+                )
+            line["plant_channel"] = channel
+    return lines
+
+
+def _channels(robot: RobotDescription, option: str, text: str) -> list[tuple[str, str]]:
+    """Interface and channel of each bus of a robot."""
+    from deploy.errors import UsageError
+
+    names = ", ".join(bus.name for bus in robot.buses)
+    channels = [bus_channel(part) for part in text.split(",")]
+    if len(channels) != len(robot.buses):
         raise UsageError(
-            f"--bus {bus}: {len(bus.split(','))} channels; robot {robot.name} has {len(robot.buses)} buses:"
-            f" {', '.join(b.name for b in robot.buses)}"
+            f"{option} {text}: {len(channels)} channels; robot {robot.name} has {len(robot.buses)} buses: {names}"
         )
+    if not all(interface and channel for interface, channel in channels):
+        raise UsageError(f"{option} {text}: a channel is empty; expected one for each of {names}")
+    return channels
 
 
 def resolve_run(
@@ -109,6 +151,8 @@ def resolve_run(
     duration_s: float | None = None,
     clock: str | None = None,
     bus: str | None = None,
+    plant_bus: str | None = None,
+    allow_overload: bool = False,
 ) -> Run:
     """Load the run that a command's options describe.
 
@@ -116,11 +160,22 @@ def resolve_run(
         ConfigurationError: a file, field or option is wrong.
 
     """
-    from schemas.load import load_run
+    from dataclasses import replace
 
-    run = load_run(scenario, overrides(sets, seed=seed, duration_s=duration_s, clock=clock, bus=bus))
-    check_buses(run.robot.description, bus)
-    return run
+    from deploy.errors import UsageError
+    from schemas.errors import ConfigurationError
+    from schemas.load import load_run, rewire
+
+    chosen = overrides(sets, seed=seed, duration_s=duration_s, clock=clock, allow_overload=allow_overload)
+    run = load_run(scenario, chosen)
+    if bus is None and plant_bus is None:
+        return run
+    lines = bus_lines(run.robot.description, bus, plant_bus)
+    try:
+        return replace(run, robot=rewire(run.robot, lines))
+    except ConfigurationError as error:
+        given = [f"{name} {text}" for name, text in (("--bus", bus), ("--plant-bus", plant_bus)) if text is not None]
+        raise UsageError(f"{' '.join(given)}: {error}") from error
 
 
 def print_json(result: object) -> None:

@@ -18,8 +18,8 @@ Peers = Annotated[
 EVERYONE = "plant,hal,controller,recorder"
 
 TEXTS = {
-    "plant": ("The simulated robot: MuJoCo and CiA 402 drives on the buses.", ""),
-    "hal": ("The hardware abstraction layer: the CANopen master of the robot.", " --bus can0,can1,can2"),
+    "plant": ("The simulated robot: MuJoCo and CiA 402 drives on the buses.", " --bus can1,can3,can5"),
+    "hal": ("The hardware abstraction layer: the CANopen master of the robot.", " --bus can0,can2,can4"),
     "controller": ("The torque controller.", ""),
     "record": ("Write all messages of a run to an MCAP file.", " --output run.mcap"),
 }
@@ -40,6 +40,7 @@ def _command(name: str) -> Callable[..., None]:
         duration: Annotated[float | None, typer.Option(help="Length of the run in seconds.")] = None,
         clock: opt.Clock = None,
         bus: opt.Bus = None,
+        allow_overload: opt.AllowOverload = False,
         base_port: opt.BasePort = None,
         session: Session = None,
         peers: Peers = EVERYONE,
@@ -51,7 +52,9 @@ def _command(name: str) -> Callable[..., None]:
         from schemas.service import Service, ServiceOptions, session_identity
         from schemas.transport import TransportConfig
 
-        run = opt.resolve_run(scenario, sets, seed=seed, duration_s=duration, clock=clock, bus=bus)
+        run = opt.resolve_run(
+            scenario, sets, seed=seed, duration_s=duration, clock=clock, bus=bus, allow_overload=allow_overload
+        )
         service = Service.RECORDER if name == "record" else Service(name)
         expected = tuple(peer.strip() for peer in peers.split(",") if peer.strip())
         if unknown := [peer for peer in expected if peer not in list(Service)]:

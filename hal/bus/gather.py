@@ -30,6 +30,8 @@ class PortGroup:
     def receive(self, timeout_s: float) -> list[tuple[int, bytes]]:
         """Wait for frames on any port: (index, n × 16 bytes) of each that has some; empty after `timeout_s` [s].
 
+        A bus that goes down meanwhile shows once, by (index, b""); its port's `down` says why.
+
         Raises:
             BusLostError: one of the buses is gone.
 
@@ -42,7 +44,8 @@ class PortGroup:
                 wait = 0.0 if arrived else min(remaining, ASK_S) if self._asked else remaining
                 for descriptor in select.select(self._descriptors, (), (), wait)[0]:
                     index = self._by_descriptor[descriptor]
-                    if frames := self.ports[index].receive(0.0):
+                    port = self.ports[index]
+                    if (frames := port.receive(0.0)) or port.down is not None:
                         arrived.append((index, frames))
             elif not arrived:
                 time.sleep(min(remaining, ASK_S))

@@ -44,6 +44,8 @@ class BusHub:
 
     """
 
+    down: str | None = None
+
     def __init__(self, channel: str | os.PathLike[str], name: str | None = None) -> None:
         self.path = socket_path(channel)
         self.name = name or os.fspath(channel)

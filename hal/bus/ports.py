@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import select
 import socket
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
 
 import can
 
 from hal.bus.address import MAX_PACKET, connect
 from hal.bus.can_frame import decode, encode, split
-from hal.bus.errors import BusError, BusLostError, BusOverflowError, BusUnavailableError
+from hal.bus.errors import BusError, BusLostError, BusOverflowError, BusStuckError, BusUnavailableError
+from hal.bus.socketcan import open_socketcan
 from hal.profile.frames import FRAME_BYTES
 from schemas.robot import Bus
 
@@ -25,17 +26,35 @@ class FramePort(Protocol):
 
     name: str
 
+    @property
+    def down(self) -> str | None:
+        """Why the bus takes and gives no frames now although it may come back, each outage at least once; else None."""
+
     def send(self, frames: bytes) -> None:
-        """Send n × 16 bytes; BusLostError when the bus is gone, BusOverflowError when it takes no more."""
+        """Send n × 16 bytes.
+
+        Raises:
+            BusLostError: the bus is gone for good.
+            BusStuckError: it takes no frames now; `BusDownError` or `BusOverflowError`.
+
+        """
 
     def receive(self, timeout_s: float) -> bytes:
-        """All that waits (n × 16 bytes), b"" after `timeout_s` [s]; BusLostError when the bus is gone."""
+        """All that waits (n × 16 bytes), b"" after `timeout_s` [s] or while `down`; BusLostError when it is gone."""
 
     def fileno(self) -> int:
         """Descriptor that is readable when frames wait, or `NO_DESCRIPTOR` when the port must be asked."""
 
     def close(self) -> None:
         """Leave the bus."""
+
+
+@runtime_checkable
+class DropCounting(Protocol):
+    """A port that knows of frames lost on their way."""
+
+    def drops(self) -> dict[str, int]:
+        """Counters that have risen since the last call, and by how much."""
 
 
 class CosimPort:
@@ -45,6 +64,8 @@ class CosimPort:
         BusUnavailableError: nobody hosts the bus within `connect_timeout_s` [s].
 
     """
+
+    down: str | None = None
 
     def __init__(self, name: str, channel: str | os.PathLike[str], connect_timeout_s: float = 2.0) -> None:
         self.name = name
@@ -108,6 +129,8 @@ class CosimPort:
 class PythonCanPort:
     """Any python-can bus as a port; error and remote frames keep their flags."""
 
+    down: str | None = None
+
     def __init__(self, name: str, bus: can.BusABC) -> None:
         self.name = name
         self._bus = bus
@@ -150,6 +173,8 @@ class PythonCanPort:
 class DirectPort:
     """Wiring in one process: what is sent is delivered at once, and the answer waits to be received."""
 
+    down: str | None = None
+
     def __init__(self, name: str, deliver: Callable[[bytes], bytes]) -> None:
         self.name = name
         self._deliver = deliver
@@ -183,9 +208,18 @@ class RecordingPort:
         self._sent: list[bytes] = []
         self._received: list[bytes] = []
 
+    @property
+    def down(self) -> str | None:
+        """As the port's."""
+        return self._port.down
+
     def send(self, frames: bytes) -> None:
-        """Send and keep n × 16 bytes."""
-        self._port.send(frames)
+        """Send n × 16 bytes and keep what went out."""
+        try:
+            self._port.send(frames)
+        except BusStuckError as error:
+            self._sent.append(frames[: error.sent])
+            raise
         self._sent.append(frames)
 
     def receive(self, timeout_s: float) -> bytes:
@@ -211,15 +245,25 @@ class RecordingPort:
         self._port.close()
 
 
-def open_port(bus: Bus, connect_timeout_s: float = 2.0) -> FramePort:
-    """Open a bus of a robot description: `cosim` directly, every other interface by python-can.
+def open_port(
+    bus: Bus, connect_timeout_s: float = 2.0, filters: Sequence[can.typechecking.CanFilter] | None = None
+) -> FramePort:
+    """Open a bus of a robot description: `cosim` and `socketcan` directly, every other interface by python-can.
+
+    Args:
+        bus: of the description.
+        connect_timeout_s: time [s] for a virtual bus to appear.
+        filters: of frames to receive, applied by the kernel (`socketcan`); on other interfaces all frames pass.
 
     Raises:
-        BusUnavailableError: nobody hosts the virtual bus, or python-can cannot open the interface.
+        BusUnavailableError: nobody hosts the virtual bus, the kernel's interface is absent or down, or python-can
+            cannot open the interface.
 
     """
     if bus.interface == "cosim":
         return CosimPort(bus.name, bus.channel, connect_timeout_s)
+    if bus.interface == "socketcan":
+        return open_socketcan(bus, filters)
     try:
         return PythonCanPort(bus.name, can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate))
     except (can.CanError, OSError, ValueError, ImportError) as error:

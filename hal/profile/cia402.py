@@ -40,6 +40,8 @@ class StatusBit(IntFlag):
     INTERNAL_LIMIT = 1 << 11
     FOLLOWS_COMMAND = 1 << 12
     """In the cyclic synchronous modes: the drive follows the command value."""
+    FOLLOWING_ERROR = 1 << 13
+    """In cyclic synchronous position mode."""
 
 
 STATE_BITS: Final = 0x6F
@@ -245,31 +247,6 @@ SUPPORTED_MODES: Final[dict[str, int]] = {
 """Object 0x6502 of each kind of drive."""
 
 
-class QuickStopOption(IntEnum):
-    """Object 0x605A."""
-
-    DISABLE = 0
-    SLOW_DOWN_RAMP = 1
-    QUICK_STOP_RAMP = 2
-    SLOW_DOWN_RAMP_STAY = 5
-    QUICK_STOP_RAMP_STAY = 6
-
-
-class DisableOperationOption(IntEnum):
-    """Object 0x605C."""
-
-    DISABLE = 0
-    SLOW_DOWN_RAMP = 1
-
-
-class FaultReactionOption(IntEnum):
-    """Object 0x605E."""
-
-    DISABLE = 0
-    SLOW_DOWN_RAMP = 1
-    QUICK_STOP_RAMP = 2
-
-
 class AbortConnectionOption(IntEnum):
     """Object 0x6007: what a drive does on its own when the master is gone."""
 
@@ -288,11 +265,16 @@ class EmergencyCode(IntEnum):
     DRIVE_TEMPERATURE = 0x4310
     INCREMENTAL_SENSOR_FAULT = 0x7305
     POSITION_SENSOR_FAULT = 0x7320
+    COMMUNICATION = 0x8100
+    """Generic; the simulated drives report a missing SYNC by it."""
     CAN_OVERRUN = 0x8110
     CAN_PASSIVE = 0x8120
     HEARTBEAT_LOST = 0x8130
     BUS_OFF_RECOVERED = 0x8140
     PDO_LENGTH = 0x8210
+    """Not processed: shorter than its mapping."""
+    PDO_LENGTH_EXCEEDED = 0x8220
+    """Longer than its mapping: the mapped bytes are used."""
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
     FOLLOWING_ERROR = 0x8611

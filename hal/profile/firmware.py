@@ -18,6 +18,8 @@ from schemas.robot import RobotDescription
 
 SMOOTHING = 0.05
 """Half width, as a fraction of d, of the band around zero torque over which `inverse_dead_zone` goes from −d to d."""
+NARROWEST_BAND = 1e-200
+"""[N·m]: a torque divided by it is still a number."""
 
 _UNIT = fixed(-1.0), fixed(1.0)
 
@@ -79,7 +81,7 @@ def inverse_dead_zone(torque: Array, width: Array, smoothing: float = 0.0) -> Ar
 
 def smoothing_band(width: Array, smoothing: float) -> Array:
     """Half width [N·m] of the band in which `inverse_dead_zone` is smoothed, never zero."""
-    band: Array = np.maximum(smoothing * width, np.finfo(np.float64).tiny)
+    band: Array = np.maximum(smoothing * width, NARROWEST_BAND)
     return band
 
 

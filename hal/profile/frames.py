@@ -12,6 +12,8 @@ import numpy.typing as npt
 from hal.errors import ProfileError
 
 FRAME_BYTES: Final = 16
+FRAME_DATA: Final = 8
+"""Data bytes at most."""
 CAN_EFF_FLAG: Final = 0x80000000
 """29-bit identifier."""
 CAN_RTR_FLAG: Final = 0x40000000
@@ -62,6 +64,21 @@ def unpack(buffer: bytes) -> Iterator[tuple[int, bytes]]:
         if length > 8:
             raise ProfileError(f"frame {can_id:#x}: length {length}, a CAN frame holds at most 8 bytes")
         yield can_id, data[:length]
+
+
+def split(buffer: bytes) -> list[bytes]:
+    """Cut a buffer into its frames.
+
+    Raises:
+        ProfileError: the buffer is not a whole number of frames, or a frame claims more than 8 bytes.
+    """
+    if len(buffer) % FRAME_BYTES:
+        raise ProfileError(f"a buffer of {len(buffer)} bytes is not a whole number of {FRAME_BYTES}-byte frames")
+    if buffer and max(buffer[4::FRAME_BYTES]) > FRAME_DATA:
+        raise ProfileError(
+            f"a frame claims {max(buffer[4::FRAME_BYTES])} bytes, a CAN frame holds at most {FRAME_DATA}"
+        )
+    return [buffer[start : start + FRAME_BYTES] for start in range(0, len(buffer), FRAME_BYTES)]
 
 
 def can_ids(buffer: bytes) -> list[int]:

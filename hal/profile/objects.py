@@ -24,6 +24,9 @@ CONSUMER_HEARTBEAT: Final = 0x1016
 PRODUCER_HEARTBEAT_MS: Final = 0x1017
 IDENTITY: Final = 0x1018
 SYNC_COUNTER: Final = 0x1019
+"""Value after which the counter in the SYNC starts again at 1; 0: SYNC has no counter."""
+ERROR_BEHAVIOUR: Final = 0x1029
+"""Sub 1: NMT state after a lost heartbeat: 0 pre-operational, 1 as it is, 2 stopped."""
 RPDO_COMMUNICATION: Final = 0x1400
 RPDO_MAPPING: Final = 0x1600
 TPDO_COMMUNICATION: Final = 0x1800
@@ -36,6 +39,7 @@ STATUSWORD: Final = 0x6041
 QUICK_STOP_OPTION: Final = 0x605A
 SHUTDOWN_OPTION: Final = 0x605B
 DISABLE_OPERATION_OPTION: Final = 0x605C
+HALT_OPTION: Final = 0x605D
 FAULT_REACTION_OPTION: Final = 0x605E
 MODE: Final = 0x6060
 MODE_DISPLAY: Final = 0x6061

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
 import pytest
 
+from deploy.can_vm import MachineUnavailableError, default_cache, prepare
 from deploy.golden import write_golden
 from schemas.load import Run, load_run
 
@@ -36,3 +38,14 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def robot_file(tmp_path: Path) -> Path:
     """A copy of arm9 that may be spoiled."""
     return Path(shutil.copytree(ARM9, tmp_path / "arm9")) / "arm9.yaml"
+
+
+@pytest.fixture(scope="session")
+def can_machine() -> None:
+    """The CAN machine can be booted; for tests marked `can_machine`, which call `deploy.can_vm.run_in_machine`."""
+    try:
+        prepare(default_cache())
+    except MachineUnavailableError as error:
+        if os.environ.get("CI"):
+            raise
+        pytest.skip(str(error))

@@ -8,13 +8,18 @@ from pathlib import Path
 import pytest
 
 from deploy.cli import main
-from deploy.commands.options import bus_channel, overrides
+from deploy.commands.options import bus_channel, overrides, resolve_run
 from deploy.errors import UsageError
 from schemas.errors import CosimError
+from schemas.load import Run
+from schemas.service import session_identity
 
 COMMANDS = (
     "up", "plant", "hal", "controller", "record", "stop", "doctor", "replay", "report", "experiment", "bus",
 )  # fmt: skip
+
+
+PAIRED = ["up", "arm9-transition", "--bus", "can0,can2,can4"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -42,7 +47,22 @@ def test_help_names_all_commands_and_loads_no_heavy_library(capsys: pytest.Captu
         (["up", "arm9-transition", "--set", "seed"], 2, "PATH=VALUE"),
         (["up", "arm9-transition", "--clock", "sundial"], 2, "clock"),
         (["up", "arm9-transition", "--duration", "nan"], 2, "duration_s"),
-        (["up", "arm9-transition", "--bus", "can0"], 2, "3 buses"),
+        (["up", "arm9-transition", "--bus", "can0"], 2, "1 channels; robot arm9 has 3 buses"),
+        (["up", "arm9-transition", "--bus", ""], 2, "3 buses"),
+        (["up", "arm9-transition", "--bus", "can0,can1,can2,can3"], 2, "4 channels; robot arm9 has 3 buses"),
+        (["up", "arm9-transition", "--bus", "can0,,can2"], 2, "--bus can0,,can2: a channel is empty"),
+        (["up", "arm9-transition", "--bus", "can0,can1,can0"], 2, "'socketcan:can0' is given twice"),
+        (["up", "arm9-transition", "--bus", "can0,can1,:x"], 2, "a channel is empty"),
+        (["up", "arm9-transition", "--plant-bus", "a,b,c"], 2, "bus arm9-0 is virtual"),
+        ([*PAIRED, "--plant-bus", "can1,can3"], 2, "--plant-bus can1,can3: 2 channels"),
+        ([*PAIRED, "--plant-bus", "can1,can3,can0"], 2, "'socketcan:can0' is given twice"),
+        ([*PAIRED, "--plant-bus", "can1,can3,pcan:x"], 2, "x is of interface pcan, but bus arm9-2"),
+        ([*PAIRED, "--plant-bus", "can1,can3,can5", "--no-plant"], 2, "with --no-plant there is no plant"),
+        (["hal", "--scenario", "arm9-transition", "--bus", "can0,can0,can1"], 2, "is given twice"),
+        (["up", "arm9-transition", "--set", "robot.rate_hz=1000"], 2, "bus arm9-2 is overloaded"),
+        (["up", "arm9-transition", "--set", "robot.compute_budget_s=0.0007"], 2, "2.060 ms > 2.000 ms"),
+        (["plant", "--scenario", "arm9-transition", "--set", "robot.rate_hz=1000"], 2, "--allow-overload"),
+        (["experiment", "transition", "--set", "robot.rate_hz=1000"], 2, "overloaded"),
         (["up", "arm9-transition", "--set", "controller.lambda=500"], 2, "lambda"),
         (["report", "nosuch.mcap"], 2, "nosuch.mcap"),
         (["replay", "nosuch.mcap"], 2, "nosuch.mcap"),
@@ -84,17 +104,14 @@ def test_a_report_of_something_else_is_refused(tmp_path: Path, capfd: pytest.Cap
 
 def test_set_values_are_yaml_and_later_options_win() -> None:
     sets = ["plant.torque_scale=0.8", "controller.integral=none", "seed=1", "robot.rate_hz=250"]
-    assert overrides(sets, seed=7, duration_s=2.0, clock="realtime", bus="can0,other") == {
+    assert overrides(sets, seed=7, duration_s=2.0, clock="realtime", allow_overload=True) == {
         "plant.torque_scale": 0.8,
         "controller.integral": "none",
         "seed": 7,
         "robot.rate_hz": 250,
         "duration_s": 2.0,
         "clock": "realtime",
-        "robot.buses.0.interface": "socketcan",
-        "robot.buses.0.channel": "can0",
-        "robot.buses.1.interface": "cosim",
-        "robot.buses.1.channel": "other",
+        "allow_overload": True,
     }
 
 
@@ -111,6 +128,57 @@ def test_set_values_are_yaml_and_later_options_win() -> None:
 )
 def test_bus_channels(text: str, expected: tuple[str, str]) -> None:
     assert bus_channel(text) == expected
+
+
+def buses(**options: str) -> list[tuple[str, str, str | None]]:
+    run = resolve_run("arm9-transition", None, **options)
+    return [(bus.interface, bus.channel, bus.plant_channel) for bus in run.robot.description.buses]
+
+
+def test_each_side_of_a_bus_may_have_its_channel() -> None:
+    assert buses(bus="can0,can2,can4", plant_bus="can1,can3,can5") == [
+        ("socketcan", "can0", "can1"),
+        ("socketcan", "can2", "can3"),
+        ("socketcan", "can4", "can5"),
+    ]
+    assert buses(bus="vcan0,arm,pcan:X") == [("socketcan", "vcan0", None), ("cosim", "arm", None), ("pcan", "X", None)]
+
+
+def test_a_given_bus_is_both_sides_of_it_and_a_given_side_leaves_the_other(robot_file: Path) -> None:
+    text = robot_file.read_text()
+    for n in range(3):
+        pair = f"interface: socketcan, channel: can{2 * n}, plant_channel: can{2 * n + 1}"
+        text = text.replace(f"channel: arm9-{n}", pair)
+    robot_file.write_text(text)
+
+    def lines(**options: str) -> list[tuple[str, str | None]]:
+        run = resolve_run("arm9-transition", [f"robot={robot_file}"], **options)
+        return [(bus.channel, bus.plant_channel) for bus in run.robot.description.buses]
+
+    assert lines() == [("can0", "can1"), ("can2", "can3"), ("can4", "can5")]
+    assert lines(bus="vcan0,vcan1,vcan2") == [("vcan0", None), ("vcan1", None), ("vcan2", None)]
+    assert lines(plant_bus="can7,can8,can9") == [("can0", "can7"), ("can2", "can8"), ("can4", "can9")]
+
+
+def test_the_services_of_a_run_agree_whatever_wire_each_is_told_of() -> None:
+    runs = [
+        resolve_run("arm9-transition", None, bus=bus) for bus in (None, "can0,can2,can4", "can1,can3,can5", "a,b,c")
+    ]
+    assert len({session_identity(run) for run in runs}) == 1
+
+
+@pytest.mark.parametrize("service", ["plant", "hal", "controller", "record"])
+def test_every_service_can_be_forced_onto_buses_that_are_too_slow(
+    service: str, runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    runs: list[Run] = []
+    monkeypatch.setattr("deploy.services.run_service", lambda _service, run, _options: runs.append(run) or 0)
+    monkeypatch.chdir(tmp_path)
+    line = [service, "--scenario", "arm9-transition", "--set", "robot.rate_hz=1000", "--bus", "can0,can2,can4"]
+    assert main(line) == 2
+    assert "bus arm9-2 is overloaded" in capfd.readouterr().err
+    assert main([*line, "--allow-overload"]) == 0
+    assert [bus.channel for bus in runs[0].robot.description.buses] == ["can0", "can2", "can4"]
 
 
 def test_usage_errors_exit_with_2() -> None:

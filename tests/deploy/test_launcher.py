@@ -95,10 +95,13 @@ def test_a_killed_service_is_named_and_ends_the_run(service: str, runtime: Path,
     out = tmp_path / "out"
     with going(out) as up:
         os.kill(service_pid(up, service), signal.SIGKILL)
-        _, errors = up.communicate(timeout=20.0)
+        output, errors = up.communicate(timeout=20.0)
     assert up.returncode == 1
     assert f"cosim: {service} was killed by SIGKILL" in errors
     assert "Traceback" not in errors
+    result = json.loads(output)  # what the log holds up to there is summed up all the same
+    assert result["failure"].startswith(f"{service} was killed by SIGKILL")
+    assert result["metrics"]["states"] > 0
     assert LogReader(out / "run.mcap").counts()["state"] > 0
 
 

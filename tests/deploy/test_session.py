@@ -13,7 +13,7 @@ from deploy.cli import main as cli
 from deploy.errors import LaunchError, UsageError
 from deploy.launcher import LOG_NAME, output_directory, plan
 from deploy.run_file import read_run, write_run
-from deploy.services import arguments, main
+from deploy.services import arguments, main, said_by
 from schemas.errors import ConfigurationError
 from schemas.load import Run, load_run
 from schemas.service import Service, session_identity
@@ -29,6 +29,12 @@ def test_run_file_round_trip(run: Run, tmp_path: Path) -> None:
     assert read_run(tmp_path / "run.json") == run
 
 
+def test_services_take_a_forced_run_from_the_run_file(tmp_path: Path) -> None:
+    run = load_run("arm9-transition", {"robot.compute_budget_s": 0.0015, "allow_overload": True})
+    write_run(run, tmp_path / "run.json")
+    assert read_run(tmp_path / "run.json") == run
+
+
 @pytest.mark.parametrize("text", ["", "{}", '{"robot": 1}', "[1, 2]"])
 def test_a_bad_run_file_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "run.json"
@@ -38,6 +44,11 @@ def test_a_bad_run_file_is_refused(text: str, tmp_path: Path, capsys: pytest.Cap
     line = ["hal", "--run-file", str(path), "--base-port", "20000", "--session", "x", "--run-directory", str(tmp_path)]
     assert main(line) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_service_names_itself_once() -> None:
+    assert said_by(Service.HAL, "no drive answers") == "hal: no drive answers"
+    assert said_by(Service.HAL, "hal: no drive answers") == "hal: no drive answers"
 
 
 def test_a_plan_gives_an_output_to_the_recorder_alone(run: Run, runtime: Path, tmp_path: Path) -> None:

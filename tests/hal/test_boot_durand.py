@@ -121,7 +121,7 @@ def test_boots_and_moves(channel: str, make: Make, port: RecordingPort) -> None:
 
     start = time.monotonic()
     report = boot(description, port)
-    assert time.monotonic() - start < 2.0
+    assert time.monotonic() - start < 5.0
 
     units = DriveUnits.of(description)
     assert report.position_counts == (3000, 5000)
@@ -136,11 +136,12 @@ def test_boots_and_moves(channel: str, make: Make, port: RecordingPort) -> None:
     assert SYNC[:4] not in {can_id.to_bytes(4, "little") for can_id, _ in sent}
 
     targets = units.counts_from_position(np.array([0.7, -0.3]))
+    answers = [base + node for base in (0x180, 0x280) for node in NODES]
     for _ in range(2):
         for node, target in zip(NODES, targets.tolist(), strict=True):
             port.send(pack(0x200 + node, objects.POSITION_STRUCT.pack(0x0F, OperationMode.CSP, target)))
         port.send(SYNC)
-        reported = receive_from(port, *(0x180 + node for node in NODES))
+        reported = receive_from(port, *answers)
     words = [objects.STATE_STRUCT.unpack(reported[0x180 + node]) for node in NODES]
     assert [word[1] for word in words] == targets.tolist()
     assert {word[0] & 0x6F for word in words} == {0x27}
@@ -149,7 +150,7 @@ def test_boots_and_moves(channel: str, make: Make, port: RecordingPort) -> None:
         for node in NODES:
             port.send(pack(0x300 + node, objects.TORQUE_STRUCT.pack(0x0F, OperationMode.CST, 10 * node)))
         port.send(SYNC)
-        reported = receive_from(port, *(0x180 + node for node in NODES), *(0x280 + node for node in NODES))
+        reported = receive_from(port, *answers)
     for node in NODES:
         assert objects.STATE_STRUCT.unpack(reported[0x180 + node])[2] == 10 * node
         assert objects.MODE_STRUCT.unpack(reported[0x280 + node]) == (10, 0)
@@ -193,7 +194,7 @@ def test_a_recoverable_fault_is_reset(channel: str, make: Make, port: RecordingP
 def test_all_missing_nodes_are_named(channel: str, make: Make, port: RecordingPort) -> None:
     make(5)
     with pytest.raises(BootError, match=r"2 of 3 drives .*joint3 \(node 3 on bus right\), joint joint9 \(node 9"):
-        boot(robot(channel, nodes=(3, 5, 9)), port, timeout_s=0.2)
+        boot(robot(channel, nodes=(3, 5, 9)), port, timeout_s=1.0)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +232,7 @@ def test_a_silent_sdo_server_is_a_boot_error(
     monkeypatch.setattr("hal.node_link.SDO_TIMEOUT_S", 0.05)
     drive = make(3)
     drive.network.subscriptions.pop(0x603)
-    with pytest.raises(BootError, match=r"joint3 .*SDO read of 0x1018:1 failed .*check the drive's power"):
+    with pytest.raises(BootError, match=r"joint3 .*SDO read of 0x1000:0 failed .*check the drive's power"):
         boot(robot(channel, nodes=(3,)), port)
 
 

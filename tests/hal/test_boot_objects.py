@@ -10,10 +10,13 @@ from hypothesis import strategies as st
 
 from hal.boot_objects import (
     PROFILE_VENDOR_ID,
+    Need,
+    SdoWrite,
     communication_writes,
     drive_writes,
     interpolation_period,
-    pdo_writes,
+    pdo_plans,
+    torque_limit_per_mille,
 )
 from schemas.robot import Drive
 from tests.hal.robots import robot
@@ -47,49 +50,54 @@ def test_interpolation_period_fits_its_object_and_is_near(period_s: float) -> No
     assert math.isclose(mantissa * 10.0**exponent, period_s, rel_tol=0.02)
 
 
-def test_remapping_follows_the_standard() -> None:
-    writes = [(w.index, w.subindex, w.value) for w in pdo_writes(drive("servo")) if w.index in (0x1400, 0x1600)]
-    assert writes == [
-        (0x1400, 1, 0x80000204),
-        (0x1600, 0, 0),
-        (0x1600, 1, 0x60400010),
-        (0x1600, 2, 0x607A0020),
-        (0x1600, 3, 0x60720010),
-        (0x1600, 0, 3),
-        (0x1400, 2, 1),
-        (0x1400, 1, 0x00000204),
-    ]
-
-
 @pytest.mark.parametrize(("kind", "valid"), [("position_pd", [0x204]), ("torque", [0x204, 0x304]), ("servo", [0x204])])
-def test_unused_rpdos_are_made_invalid(kind: str, valid: list[int]) -> None:
-    last = {w.index: w.value for w in pdo_writes(drive(kind)) if w.subindex == 1 and 0x1400 <= w.index < 0x1600}
-    assert set(last) == {0x1400, 0x1401}
-    assert [value for value in last.values() if not value >> 31] == valid
-
-
-def test_presets_of_other_makers_are_made_invalid_where_they_exist() -> None:
-    writes = pdo_writes(drive("torque", vendor_id=0x1234))
-    others = {(w.index, w.value, w.optional) for w in writes if w.index & 0xFF in (2, 3)}
-    assert others == {
-        (0x1402, 0x80000404, True),
-        (0x1403, 0x80000504, True),
-        (0x1802, 0xC0000384, True),
-        (0x1803, 0xC0000484, True),
+def test_the_pdos_of_each_kind(kind: str, valid: list[int]) -> None:
+    plans = {plan.name: plan for plan in pdo_plans(drive(kind))}
+    assert list(plans) == ["TPDO1", "RPDO1", "TPDO2", "RPDO2"]
+    assert [plan.cob_id for name, plan in plans.items() if name[0] == "R" and plan.pdo is not None] == valid
+    assert {name: (plan.communication, plan.mapping) for name, plan in plans.items()} == {
+        "TPDO1": (0x1800, 0x1A00),
+        "RPDO1": (0x1400, 0x1600),
+        "TPDO2": (0x1801, 0x1A01),
+        "RPDO2": (0x1401, 0x1601),
     }
+    assert [plans[name].cob_id for name in ("TPDO1", "TPDO2")] == [0x40000184, 0x40000284]
+    assert [plan.types for plan in plans.values() if plan.pdo is not None][::2] == [(1,), (0,)]
+
+
+def test_another_makers_presets_are_not_used_and_its_types_are_tried() -> None:
+    plans = {plan.name: plan for plan in pdo_plans(drive("torque", vendor_id=0x1234))}
+    assert [name for name, plan in plans.items() if plan.pdo is None] == ["TPDO3", "RPDO3", "TPDO4", "RPDO4"]
+    assert plans["TPDO1"].types == (1,), "the cycle is built on reports at each SYNC"
+    assert plans["TPDO2"].types == (1, 0, 255, 254)
+    assert plans["RPDO1"].types == plans["RPDO2"].types == (1, 0, 255, 254)
 
 
 def test_another_makers_drive_gets_no_parameter_of_ours() -> None:
-    def written(vendor_id: int) -> dict[int, int]:
-        description = robot("torque", drive={"vendor_id": vendor_id})
+    def writes(kind: str, vendor_id: int) -> dict[int, SdoWrite]:
+        description = robot(kind, drive={"vendor_id": vendor_id})
         joint = description.joints[0]
-        writes = [*communication_writes(description, joint.drive), *drive_writes(description, joint)]
-        return {write.index: write.value for write in [*writes, *pdo_writes(joint.drive)]}
+        every = [*communication_writes(description, joint.drive), *drive_writes(description, joint)]
+        return {write.index: write for write in every}
 
-    def own_range(writes: dict[int, int]) -> list[int]:
-        return [index for index in writes if 0x2000 <= index < 0x6000]
+    own, foreign = writes("torque", PROFILE_VENDOR_ID), writes("torque", 0xFB)
+    assert [index for index in own if 0x2000 <= index < 0x6000] == [0x2001, 0x2002, 0x2003, 0x2004, 0x2005]
+    assert [index for index in foreign if 0x2000 <= index < 0x6000] == []
+    assert {write.need for write in own.values()} == {Need.ALWAYS}
+    assert [index for index, write in foreign.items() if write.need is Need.ALWAYS] == [0x1017]
+    assert [index for index, write in foreign.items() if write.need is Need.WISH] == [0x1006, 0x6007]
+    assert foreign[0x6007].value == 3  # quick stop when the heartbeat is missing
+    assert writes("servo", 0xFB)[0x6072].need is Need.ALWAYS, "it is part of the servo's command"
 
-    assert own_range(written(PROFILE_VENDOR_ID)) == [0x2001, 0x2002, 0x2003, 0x2004, 0x2005]
-    foreign = written(0xFB)
-    assert own_range(foreign) == []
-    assert foreign[0x6007] == 3  # quick stop when the heartbeat is missing
+
+@given(st.floats(0.01, 30.0), st.integers(1, 5000), st.floats(20.0, 300.0))
+def test_the_torque_limit_is_never_rounded_up(share: float, rated_mnm: int, gear: float) -> None:
+    rated = rated_mnm / 1000.0
+    limit = share * rated * gear
+    description = robot(
+        "torque", joint={"gear_ratio": gear, "torque_limit": limit}, drive={"rated_motor_torque": rated}
+    )
+    per_mille = torque_limit_per_mille(description.joints[0])
+    unit = rated * gear / 1000.0
+    assert per_mille * unit <= limit * (1.0 + 1e-9)
+    assert (per_mille + 1) * unit > limit * (1.0 - 1e-9)

@@ -21,6 +21,9 @@ from plant_service.device import DriveDevice
 from plant_service.object_dictionary import key_of
 from schemas.messages import DriveState
 from schemas.robot import Bus, Drive, Joint, RobotDescription
+from tests.hal.foreign_device import ForeignSlave
+from tests.hal.foreign_objects import Habits
+from tests.hal.foreign_robot import Wire, foreign_robot
 
 KINDS = ("torque", "position_pd", "servo")
 
@@ -60,6 +63,7 @@ class Plant:
     def __init__(self) -> None:
         self.axes = [StandingAxis(100 * index) for index in range(9)]
         self.devices: list[list[DriveDevice]] = []
+        self.fixed: list[dict[int, int]] = []
         joints = []
         for index, axis in enumerate(self.axes):
             kind = KINDS[index % 3]
@@ -68,6 +72,7 @@ class Plant:
                 key_of(objects.IDENTITY, 2): 1,
                 key_of(objects.SUPPORTED_DRIVE_MODES): SUPPORTED_MODES[kind],
             }
+            self.fixed.append(fixed)
             if index % 3 == 0:
                 self.devices.append([])
             self.devices[-1].append(DriveDevice(index + 1, axis, fixed))
@@ -206,6 +211,55 @@ def test_a_failed_boot_leaves_no_drive_powered(plant: Plant) -> None:
 
     ports = [DirectPort(f"bus{bus}", lambda frames, bus=bus: deliver(bus, frames)) for bus in range(3)]
     with pytest.raises(BootError, match=r"joint8 .*0x2310"):
-        boot_network(plant.robot, ports, timeout_s=0.05)
+        boot_network(plant.robot, ports)
     assert powered == set(range(1, 9))
     assert [device.state for device in devices] == [DriveState.SWITCH_ON_DISABLED] * 8 + [DriveState.FAULT]
+
+
+def variant(tmp_path: Path, **changes: str) -> Path:
+    """An EDS file of the drive with some defaults of its records changed, and these not writable."""
+    lines, section = [], ""
+    for line in Path(objects.eds_path()).read_text(encoding="utf-8").splitlines():
+        section = line[1:-1] if line.startswith("[") else section
+        key, _, value = line.partition("=")
+        if section in changes:
+            value = {"DefaultValue": changes[section], "AccessType": "const"}.get(key, value)
+        lines.append(f"{key}={value}" if "=" in line else line)
+    path = tmp_path / "variant.eds"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"1A00sub0": "2"}, r"TPDO1 maps 6 bytes \(0x60410010, 0x60640020\), must be 8 \(.*fixed at 2"),
+        ({"1800sub2": "255"}, r"TPDO1 has transmission type 255, must be 1; .*0x1800:2 is fixed at 255"),
+        ({"1400sub1": "0x201"}, r"RPDO1 has COB-ID 0x00000201, must be 0x00000204"),
+        ({"1000": "0x00020191"}, r"device type 0x1000 is 0x00020191, profile CiA 401"),
+    ],
+)
+def test_a_drive_with_other_fixed_records_is_refused(
+    plant: Plant, tmp_path: Path, changes: dict[str, str], message: str
+) -> None:
+    plant.devices[1][0] = DriveDevice(4, plant.axes[3], plant.fixed[3], variant(tmp_path, **changes))
+    with pytest.raises(BootError, match=r"joint3 \(node 4 on bus bus1\).*" + message):
+        boot_network(plant.robot, [plant.wire(bus) for bus in range(3)], timeout_s=0.1)
+    assert not any(axis.holds for axis in plant.axes), "nothing was enabled"
+
+
+def test_no_sync_reaches_a_simulated_drive_for_another_ones_sake(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hal.enable.PATIENCE_S", 0.0)
+    wire = Wire([ForeignSlave(1, Habits(obeys="sync"))])
+    own = plant.devices[0][1]
+    wire.intercept(lambda frames: wire.answer(frames) + plant.answer(0, frames))
+    guest = foreign_robot((1,)).joints[0]
+    host = plant.robot.joints[1]
+    bus = Bus(name="right", channel="right")
+    host = host.model_copy(update={"drive": host.drive.model_copy(update={"bus": "right"})})
+    robot = plant.robot.model_copy(update={"buses": (bus,), "joints": (host, guest)})
+    plant.devices[0] = [own]
+    with pytest.raises(BootError, match=r"joint1 \(node 1 on bus right\): stays in SWITCH_ON_DISABLED"):
+        boot_network(robot, [wire], timeout_s=0.2)
+    assert 0x080 not in {can_id for can_id, _ in wire.sent}
+    assert own.state is DriveState.SWITCH_ON_DISABLED

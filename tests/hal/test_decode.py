@@ -5,8 +5,10 @@ import struct
 import numpy as np
 import pytest
 
-from hal.decode import Decoder
+from hal.bus.error_frames import Trouble
+from hal.decode import Decoder, mode_requests
 from hal.errors import HalError, ProfileError
+from hal.profile.frames import unpack
 from schemas.messages import DriveState
 from tests.hal.robots import FAULT, frame, imu, mode_report, report, robot, wrist
 
@@ -38,18 +40,19 @@ def test_the_last_of_two_reports_counts() -> None:
 @pytest.mark.parametrize(
     "foreign",
     [
-        frame(0x181, b"\0" * 7),
         frame(0x181 | 0x80000000, b"\0" * 8),
         frame(0x181 | 0x40000000, b"\0" * 8),
         frame(0x7FF, b"\0" * 8),
         frame(0x1FFFFFFF | 0x80000000, b"\0" * 8),
         frame(0x182, struct.pack("<Hih", 0x0008, 5, 5)),
         frame(0x080, b""),
-        frame(0x281, b"\x0a\x00"),
-        frame(0x081, b"\x10"),
+        frame(0x20000040, b"\0" * 8),
+        frame(0x20000181, b"\0" * 8),
+        frame(0x581, bytes.fromhex("4341600027060000")),
+        frame(0x581, bytes.fromhex("8061600000000206")),
     ],
 )
-def test_foreign_and_short_frames_change_nothing(foreign: bytes) -> None:
+def test_foreign_frames_change_nothing(foreign: bytes) -> None:
     unit = decoder("torque", "torque")
     before = unit.decode([report(1, 77), report(2, 88)])
     after = unit.decode([foreign, b""])
@@ -66,6 +69,14 @@ def test_modes_and_errors_are_kept_between_reports() -> None:
     measured = unit.decode([report(1), report(2)])
     assert measured.mode.tolist() == [10, 8]
     assert measured.error_code.tolist() == [0x7305, 0]
+
+
+def test_a_drive_without_error_codes_reports_its_mode_alone() -> None:
+    unit = decoder("torque", "torque")
+    measured = unit.decode([report(1) + frame(0x281, b"\x0a"), report(2)])
+    assert measured.mode.tolist() == [10, 8]
+    assert measured.error_code.tolist() == [0, 0]
+    assert measured.notices == ()
 
 
 def test_what_did_not_change_is_the_array_of_the_cycle_before() -> None:
@@ -106,7 +117,59 @@ def test_emergencies_name_joint_and_code() -> None:
     (reset,) = unit.decode([frame(0x081, bytes(8)), b""]).notices
     assert (reset.severity, reset.stops) == ("info", False)
     (unknown,) = unit.decode([frame(0x081, struct.pack("<HB5s", 0xFF01, 0x81, b"")), b""]).notices
-    assert "unknown to the HAL" in unknown.text
+    assert "EMCY 0xff01 (of the maker)" in unknown.text
+
+
+@pytest.mark.parametrize(
+    ("foreign", "text", "stops"),
+    [
+        (frame(0x181, bytes(7)), "joint j0: TPDO1 has 7 bytes, expected 8", True),
+        (frame(0x281, b"\x0a\x00"), "joint j0: TPDO2 has 2 bytes, expected 3", True),
+        (frame(0x081, b"\x10"), "joint j0: EMCY has 1 bytes, expected 8", False),
+        (frame(0x432, bytes(8)), "sensor imu: a frame has 8 bytes, expected 6", False),
+    ],
+)
+def test_a_wrong_length_changes_nothing_and_is_told_at_its_onset(foreign: bytes, text: str, stops: bool) -> None:
+    unit = decoder("torque", "torque")
+    unit.decode([report(1, 77), report(2, 88)])
+    for _ in range(2):
+        (notice,) = unit.decode([foreign, report(2, 88)]).notices
+        assert notice.text.startswith(text)
+        assert (notice.kind, notice.stops) == ("frame_length", stops)
+        measured = unit.decode([foreign, report(2, 88)])
+        assert measured.notices == ()
+        assert measured.position[0] == pytest.approx(77 / 4096 / 100 * 2 * np.pi)
+        assert unit.decode([report(1, 77), report(2, 88)]).notices == ()
+
+
+def test_error_frames_are_handed_out_with_their_bus() -> None:
+    unit = decoder("torque", "torque")
+    off, passive = frame(0x20000040, bytes(8)), frame(0x20000004, bytes.fromhex("0010000000000080"))
+    measured = unit.decode([report(1) + off, report(2)])
+    assert [(bus, each.troubles) for bus, each in measured.errors] == [(0, (Trouble.BUS_OFF,))]
+    assert measured.heard == (True, True)
+    measured = unit.decode([off, passive + passive])
+    assert [bus for bus, _ in measured.errors] == [0, 1, 1]
+    assert measured.heard == (False, False)
+    assert measured.silent_cycles.tolist() == [1, 1]
+    assert unit.decode([b"", report(2)]).heard == (False, True)
+
+
+def test_mode_and_error_come_by_sdo_as_well() -> None:
+    unit = decoder("torque", "torque")
+    requests = list(unpack(mode_requests(2)))
+    assert requests == [
+        (0x602, bytes.fromhex("4061600000000000")),
+        (0x602, bytes.fromhex("403F600000000000")),
+    ]
+    answers = frame(0x582, bytes.fromhex("4F61600008000000")) + frame(0x582, bytes.fromhex("4B3F600005730000"))
+    before = unit.decode([report(1), report(2) + mode_report(2, 10)])
+    assert before.mode.tolist() == [8, 10]
+    measured = unit.decode([report(1), report(2) + answers])
+    assert measured.mode.tolist() == [8, 8]
+    assert measured.error_code.tolist() == [0, 0x7305]
+    assert measured.answered == {1}
+    assert unit.decode([report(1), report(2)]).answered == set()
 
 
 def test_a_boot_up_in_operation_is_a_lost_node() -> None:
@@ -115,6 +178,8 @@ def test_a_boot_up_in_operation_is_a_lost_node() -> None:
     (reset,) = unit.decode([frame(0x701, b"\x00"), b""]).notices
     assert (reset.kind, reset.stops) == ("node_lost", True)
     assert "was reset" in reset.text
+    assert unit.decode([frame(0x701, b"\x00"), b""]).reset == {0}
+    assert unit.decode([frame(0x701, b"\x05"), b""]).reset == set()
     (left,) = unit.decode([frame(0x701, b"\x7f"), b""]).notices
     assert "left OPERATIONAL" in left.text
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 
 import numpy as np
 import pytest
 
+from hal.bus.errors import BusOverflowError
 from hal.bus.ports import DirectPort
 from hal.master import Master
-from hal.profile.frames import unpack
+from hal.profile.frames import can_ids, pack, unpack
 from hal.profile.identifiers import HAL_NODE_ID, HEARTBEAT, SYNC
 from hal.profile.units import DriveUnits
 from schemas.messages import HalStatus
+from schemas.robot import RobotDescription, Safety
 from tests.hal.robots import report, robot
 
 
@@ -73,3 +76,66 @@ def test_heartbeats_keep_their_pace_when_syncs_are_left_out(step: int) -> None:
     gaps = np.diff(beats)
     assert (gaps >= cycles).all()
     assert (gaps < cycles + step).all()
+
+
+def heartbeats(description: RobotDescription, cycles: int, pause_s: float) -> int:
+    """Heartbeats of the HAL in some cycles of lockstep, each of which takes a wall-clock time."""
+    sent: list[bytes] = []
+
+    def deliver(frames: bytes) -> bytes:
+        sent.append(frames)
+        return b""
+
+    master = Master(description, [DirectPort("a", deliver), DirectPort("b", lambda frames: b"")])
+    for sequence in range(cycles):
+        time.sleep(pause_s)
+        master.sync(sequence)
+    return b"".join(sent).count(pack(HEARTBEAT + HAL_NODE_ID, b"\x05"))
+
+
+def test_other_makers_drives_get_heartbeats_by_the_wall_clock() -> None:
+    safety = Safety(heartbeat_s=0.02)
+    own = robot("torque", safety=safety)
+    foreign = robot("torque", safety=safety, drive={"vendor_id": 0x1234})
+    assert heartbeats(own, 10, 0.012) == 1
+    assert heartbeats(foreign, 10, 0.012) == 10
+    assert heartbeats(foreign, 10, 0.0) <= 5
+
+
+class Unreliable(DirectPort):
+    """A bus that takes no more than some bytes at a time, then says so."""
+
+    room = 0
+
+    def send(self, frames: bytes) -> None:
+        if self.room < len(frames):
+            raise BusOverflowError(f"bus {self.name}: can7 takes no more frames", self.room)
+        super().send(frames)
+
+
+def test_a_full_bus_is_in_trouble_and_only_what_it_took_is_logged() -> None:
+    answers = [report(1), report(2)]
+    near = Unreliable("a", lambda frames: answers[0] if SYNC in can_ids(frames) else b"")
+    master = Master(
+        robot("torque", "torque"),
+        [near, DirectPort("b", lambda frames: answers[1] if SYNC in can_ids(frames) else b"")],
+    )
+    master.core.start(np.zeros(2))
+    near.room = 16
+    master.sync(0)
+    near.room = 0
+    master.gather(0, 0.001)
+    master.apply(None)
+    sent = [list(unpack(frames.sent)) for frames in master.frames(0)]
+    assert [can_id for can_id, _ in sent[0]] == [HEARTBEAT + HAL_NODE_ID]
+    assert [can_id for can_id, _ in sent[1]][:2] == [HEARTBEAT + HAL_NODE_ID, SYNC]
+    assert master.core.status is HalStatus.SAFE_STOP
+    assert master.core.troubled_buses == ("a",)
+    near.room = 1000
+    for sequence in range(1, 5):
+        master.sync(sequence)
+        master.gather(sequence, 0.001)
+        master.apply(None)
+    kinds = [event.kind for event in master.core.drain_events()]
+    assert kinds == ["bus_down", "safe_stop"]
+    assert master.core.expected_reports[0], "its frames are awaited again"

@@ -124,14 +124,17 @@ def test_event_driven_rpdo_acts_at_once(bench):
     assert (bench.axis.motion, bench.axis.target) == ("position", 100)
 
 
-@pytest.mark.parametrize("length", [6, 8])
-def test_wrong_length_is_dropped_with_emcy(bench, length):
+@pytest.mark.parametrize(
+    ("length", "emcy", "motion"),
+    [(6, "1082110000000000", "hold"), (8, "2082110000000000", "position")],
+    ids=["short: not processed", "long: its first bytes"],
+)
+def test_wrong_length(bench, length, emcy, motion):
     bench.enable()
     data = struct.pack("<Hbi", 0x0F, 8, 100).ljust(8, b"\0")[:length]
-    # 0x8210, register generic | communication
-    assert bench.send(0x205, data) == [(0x085, bytes.fromhex("1082110000000000"))]
+    assert bench.send(0x205, data) == [(0x085, bytes.fromhex(emcy))]
     bench.sync()
-    assert bench.axis.motion == "hold"
+    assert bench.axis.motion == motion
     assert bench.read(0x1001) == 0x11
     bench.command_position(100)
     assert bench.sync()[0] == (0x085, bytes(8))

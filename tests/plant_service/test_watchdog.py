@@ -34,14 +34,31 @@ def deadline(milliseconds: int, received_ns: int) -> Rpdo:
         (unit(period_us=0), 3, 4, None, True, 4 + STALE_TORQUE_NS, [RPDO_TIMEOUT]),
         (unit(), 3, 4, 2, True, 4 + 2 * MS, [RPDO_TIMEOUT]),
         (unit(period_us=0), 3, 4, None, False, NEVER_NS, []),
-        (unit(cycles=0), 3, 4, 2, True, NEVER_NS, []),
+        (unit(cycles=0), 3, 4, None, True, NEVER_NS, []),
+        (unit(cycles=0), 3, 4, 2, True, 4 + 2 * MS, [RPDO_TIMEOUT]),
         (unit(), None, None, None, True, NEVER_NS, []),
     ],
 )
 def test_what_runs_out_first_does_so_when_foretold(watchdogs, sync_ns, command_ns, timer, torque, due_ns, codes):
     watchdogs.sync_ns, watchdogs.command_ns = sync_ns, command_ns
     rpdos = [] if timer is None else [deadline(timer, command_ns)]
-    assert watchdogs.due_ns(rpdos, torque=torque) == due_ns
-    assert watchdogs.expired(rpdos, due_ns - 1, torque=torque) == []
-    assert watchdogs.expired(rpdos, due_ns, torque=torque) == codes
-    assert watchdogs.expired(rpdos, due_ns, torque=torque) == []
+    assert watchdogs.due_ns(rpdos, enabled=True, torque=torque) == due_ns
+    assert watchdogs.expired(rpdos, due_ns - 1, enabled=True, torque=torque) == []
+    assert watchdogs.expired(rpdos, due_ns, enabled=True, torque=torque) == codes
+    assert watchdogs.expired(rpdos, due_ns, enabled=True, torque=torque) == []
+
+
+def test_a_drive_that_is_not_enabled_watches_the_event_timers_alone():
+    watchdogs = unit()
+    watchdogs.sync_ns = watchdogs.command_ns = 3
+    assert watchdogs.due_ns([], enabled=False, torque=False) == NEVER_NS
+    rpdos = [deadline(2, 4)]
+    assert watchdogs.due_ns(rpdos, enabled=False, torque=False) == 4 + 2 * MS
+    assert watchdogs.expired(rpdos, 10 * MS, enabled=False, torque=False) == [RPDO_TIMEOUT]
+
+
+def test_cleared_it_expects_nothing():
+    watchdogs, rpdos = unit(), [deadline(2, 4)]
+    watchdogs.sync_ns = watchdogs.command_ns = 3
+    watchdogs.clear(rpdos)
+    assert watchdogs.due_ns(rpdos, enabled=True, torque=True) == NEVER_NS

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from schemas.errors import ConfigurationError
-from schemas.load import load_run
+from schemas.load import load_robot, load_run
 
 
 def _set(path: str, value: Any) -> Callable[[Any], None]:
@@ -45,6 +45,7 @@ BAD = [
     (_set("robot.urdf", "other.urdf"), "urdf: no file at"),
     (_set("robot.urdf", "package://no_such_package/a.urdf"), "'no_such_package' is not installed"),
     (_set("robot.rate_hz", 4000.0), "bus can0 is overloaded"),
+    (_set("robot.compute_budget_s", 0.002), "commands miss their SYNC: reports 0.495 ms + compute 2.000 ms"),
     (_set("scenario.robot", "no-such-robot"), "no robot 'no-such-robot'"),
     (_set("scenario.plant", {"initial_posture": {"knee": 0.0}}), "plant.initial_posture: robot pendulum has no joint"),
     (_set("scenario.plant", {"substep_s": 0.0007}), "plant.substep_s: 0.0007 s does not divide the period 0.002 s"),
@@ -73,6 +74,26 @@ def test_overload_message_shows_the_arithmetic(files: Any) -> None:
         ConfigurationError, match=r"1×SYNC\(55 bit\) \+ 2×TPDO1\(135 bit\) .* in 0.25 ms at 1 Mbit/s = "
     ):
         files.load()
+
+
+OVERLOADED = [
+    {"robot.rate_hz": 4000.0, "plant.substep_s": 0.00025},
+    {"robot.compute_budget_s": 0.0014},  # 75 % of the bus, yet too late for the SYNC
+]
+
+
+@pytest.mark.parametrize("overrides", OVERLOADED, ids=["over 100 %", "too late"])
+def test_a_plan_that_does_not_fit_runs_only_when_it_is_forced_to(files: Any, overrides: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match=r"To make it fit: .*; to run it all the same: --allow-overload"):
+        files.load(**overrides)
+    assert files.load(**overrides, allow_overload=True).scenario.allow_overload
+    files.scenario["allow_overload"] = True
+    run = files.load(**overrides)
+    robot = {path.removeprefix("robot."): value for path, value in overrides.items() if path.startswith("robot.")}
+    name = str(files.folder / "pendulum.yaml")
+    assert load_robot(name, robot, allow_overload=True) == run.robot
+    with pytest.raises(ConfigurationError, match="--allow-overload"):
+        load_robot(name, robot)
 
 
 def test_broken_yaml_names_the_file(files: Any) -> None:

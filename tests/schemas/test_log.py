@@ -71,6 +71,7 @@ def test_public_reader_finds_schemas_configuration_and_simulated_times(tmp_path:
         assert summary is not None
         assert [channel.topic for channel in summary.channels.values()] == [
             "/state", "/command", "/trace", "/truth", "/event", "/health", "/operator", "/bus/can0", "/bus/can1",
+            "/load/can0", "/load/can1",
         ]  # fmt: skip
         assert all(channel.message_encoding == "json" for channel in summary.channels.values())
         assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}

@@ -13,10 +13,12 @@ from schemas.base import ControlMode, Model
 from schemas.messages import (
     AppliedCommand,
     BusFrames,
+    BusStatistics,
     ControllerTrace,
     CycleStatistics,
     DriveState,
     Event,
+    FrameStatistics,
     HalStatus,
     ImuSample,
     JointCommand,
@@ -118,6 +120,17 @@ MESSAGES: dict[type[Model], st.SearchStrategy[Model]] = {
         real_time_factor=numbers,
     ),
     OperatorRequest: st.builds(OperatorRequest, action=st.sampled_from(["stop", "reset"]), reason=names),
+    BusStatistics: st.builds(
+        BusStatistics,
+        **common,
+        bus=names,
+        cycles=sequences,
+        load_mean=numbers,
+        load_max=numbers,
+        report_end_max_s=numbers,
+        command_end_max_s=numbers,
+        frames=st.lists(st.builds(FrameStatistics, can_id=sequences, frames=sequences), max_size=2).map(tuple),
+    ),
 }
 
 
@@ -192,7 +205,7 @@ def test_messages_are_frozen() -> None:
 def test_every_topic_has_a_message_and_every_message_a_topic(run: Any) -> None:
     topics = topics_of(run.robot.description)
     assert set(topics.values()) == set(MESSAGES)
-    assert list(topics) == [*TOPICS, "bus/can0", "bus/can1"]
+    assert list(topics) == [*TOPICS, "bus/can0", "bus/can1", "load/can0", "load/can1"]
 
 
 def test_stamp_is_sequence_and_time() -> None:

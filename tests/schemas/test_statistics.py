@@ -1,12 +1,12 @@
-"""Cycle times summed up once a second, and their percentiles over many seconds."""
+"""Cycle times summed up once a second, and their percentiles over many seconds; summaries of buses merged."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from schemas.messages import CycleStatistics
-from schemas.statistics import CycleMeter, percentile
+from schemas.messages import BusStatistics, CycleStatistics, FrameStatistics
+from schemas.statistics import CycleMeter, merge, percentile
 
 PERIOD_S = 0.002
 
@@ -78,3 +78,36 @@ def test_late_and_missed_are_those_of_the_summary_alone() -> None:
         assert found is not None
         counts.append((found.late_cycles, found.missed_commands))
     assert counts == [(3, 1), (0, 0), (2, 5)]
+
+
+def _load(bus: str = "can0", *, sequence: int = 0, cycles: int = 1, load: float = 0.5, **frames: int) -> BusStatistics:
+    one = FrameStatistics(can_id=0x181, frames=frames.get("count", 1), late=frames.get("late", 0), wait_mean_s=1e-4)
+    return BusStatistics(
+        sequence=sequence, time_ns=2 * sequence, bus=bus, cycles=cycles, load_mean=load, load_max=load,
+        report_end_max_s=load * 1e-3, command_end_max_s=1e-3, frames=(one,),
+    )  # fmt: skip
+
+
+def test_one_summary_merges_to_itself() -> None:
+    assert merge([_load()]) == _load()
+
+
+def test_merged_counts_add_up_means_are_weighted_and_maxima_kept() -> None:
+    merged = merge([_load(sequence=5, cycles=3, load=0.6, count=30, late=2), _load(sequence=1, load=0.2, count=10)])
+    assert (merged.sequence, merged.time_ns, merged.cycles) == (5, 10, 4)
+    assert merged.load_mean == pytest.approx(0.5)
+    assert (merged.load_max, merged.report_end_max_s) == (0.6, 0.6e-3)
+    assert (merged.frames[0].frames, merged.frames[0].late) == (40, 2)
+
+
+def test_identifiers_of_all_summaries_are_in_the_merged_one_in_their_order() -> None:
+    other = _load().model_copy(update={"frames": (FrameStatistics(can_id=0x80, frames=7, wait_max_s=1e-3),)})
+    merged = merge([_load(), other])
+    assert [(each.can_id, each.frames) for each in merged.frames] == [(0x80, 7), (0x181, 1)]
+    assert merged.frames[0].wait_max_s == 1e-3
+
+
+@pytest.mark.parametrize("parts", [[], [_load(), _load("can1")]])
+def test_summaries_of_no_or_several_buses_are_refused(parts: list[BusStatistics]) -> None:
+    with pytest.raises(ValueError, match="one bus"):
+        merge(parts)
