@@ -52,7 +52,7 @@ def find_place(path: Path | None, robot: str | None, run: Run | None, base_port:
     if run is not None:
         return Place(run.robot.description, path, run=run, base_port=base_port)
     if robot is not None:
-        return Place(load_robot(robot).description, path, base_port=base_port)
+        return Place(load_robot(robot, allow_overload=True).description, path, base_port=base_port)
     if path is not None:
         raise UsageError(f"{path}: give --robot or --scenario, so that its frames have names")
     running = read_run(Path(choose_session(base_port).output) / RUN_NAME)

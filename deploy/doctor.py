@@ -122,6 +122,13 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
             " meet one, a worst cycle's commands may be late",
             soft_wrap=True,
         )
+    if plan.fits and plan.crowded:
+        console.print(
+            f"commands follow the next cycle's reports: {plan.report_time_s * 1e3:.3f} ms of reports and"
+            f" {plan.command_time_s * 1e3:.3f} ms of commands on another bus share {plan.period_s * 1e3:.3f} ms: in a"
+            " worst cycle the last commands are late",
+            soft_wrap=True,
+        )
     for load in plan.overloaded:
         console.print(f"load [red]does not fit[/]: bus {load.bus} is overloaded, {load.fraction:.1%}", soft_wrap=True)
     if not plan.fits:

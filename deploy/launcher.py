@@ -16,7 +16,9 @@ from deploy.progress import Monitor, RunProgress
 from deploy.run_file import write_run
 from deploy.services import arguments, said_by
 from deploy.supervisor import Child, Supervisor, service_environment
+from schemas.lifecycle import STOPPED
 from schemas.load import Run
+from schemas.messages import Event
 from schemas.service import Service, ServiceOptions, session_identity
 
 LOG_NAME = "run.mcap"
@@ -135,15 +137,20 @@ def launch(plan: Plan, progress: RunProgress, make_monitor: MonitorMaker) -> Out
 def _supervise(supervisor: Supervisor, monitor: Monitor, progress: RunProgress, interrupted: list[int]) -> bool:
     """Watch until the HAL has ended; True when the recorder went missing on the way."""
     recorder_lost = False
+    hal_left = False
     while not interrupted:
-        progress.show(monitor.poll())
+        heard = monitor.poll()
+        hal_left |= any(
+            isinstance(each, Event) and (each.service, each.kind) == (Service.HAL, STOPPED) for each in heard
+        )
+        progress.show(heard)
         ended = {child.service: child for child in supervisor.ended()}
         if Service.HAL in ended and ended[Service.HAL].process.returncode == 0:
             _finish(supervisor)
             progress.show(monitor.poll())
             return recorder_lost
         lost = ended.pop(Service.RECORDER, None)
-        if lost is not None and not recorder_lost:
+        if lost is not None and not recorder_lost and not (hal_left and lost.process.returncode == 0):
             recorder_lost = True
             text = f"{lost.epitaph()}; the run goes on without a log"
             progress.say(text, "warning")

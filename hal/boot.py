@@ -9,36 +9,43 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from hal.boot_objects import (
     HEARTBEAT_TOLERANCE,
+    PROFILE_VENDOR_ID,
     Need,
     SdoWrite,
     communication_writes,
     drive_writes,
-    is_foreign,
     pdo_plans,
 )
 from hal.bus.ports import FramePort
 from hal.enable import PowerUp
 from hal.errors import BootError, HalError
-from hal.find import FoundNodes, disable, find_nodes, for_all
-from hal.node_link import SYNC_WINDOW_US, NodeLink
+from hal.find import FoundNodes, NodeIdentity, disable, find_nodes, for_all
+from hal.node_link import NodeLink
 from hal.pdo_setup import set_up_pdo
 from hal.profile import identifiers, objects
 from hal.profile.cia402 import OperationMode
 from hal.profile.frames import pack
 from hal.profile.sensors import force_torque_command
 from hal.profile.units import DriveUnits
+from hal.sdo_client import SYNC_WINDOW_US
 from schemas.base import Vector
 from schemas.robot import Joint, RobotDescription
 
 POSITION_MARGIN_RAD = 0.05
 """How far beyond its range a joint may stand at the boot."""
+ECHOES: Final = 0.5
+"""Share of answers heard twice that proves nothing yet: some may be another client's."""
 HEARTBEAT_WAIT_S = 2.0
 """Wait for the first heartbeat of another maker's drive, at least."""
+NOT_SIMULATED: Final = (
+    "has the simulated drives' vendor id, but object 0x2006 does not say so; the standards' objects alone are used"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +64,8 @@ class DriveReport:
     """Object 0x6064."""
     position: float
     """The same at the joint [rad]."""
+    foreign: bool
+    """It is another maker's and lives in wall-clock time."""
     notes: tuple[str, ...] = ()
     """What the drive did not take but can do without, e.g. that it cannot watch the HAL's heartbeat."""
 
@@ -106,19 +115,21 @@ def boot_network(
     climbs: list[PowerUp] = []
     try:
         _rejoin(found)
-        notes = for_all(links, lambda index, link: _configure(robot, link, robot.joints[index]))
+        notes = for_all(
+            links, lambda index, link: _configure(robot, link, robot.joints[index], found.identities[index])
+        )
         counts = for_all(links, lambda _, link: link.read(objects.POSITION_ACTUAL))
         positions = _positions(robot, counts)
         for_all(links, lambda index, link: _check_position(link, robot.joints[index], positions[index]))
-        _check_restarts(found)
-        _await_heartbeats(robot, links)
-        _check_restarts(found)
-        climbs += _climbs(robot, links, counts, timeout_s)
+        _check_nodes(found)
+        _await_heartbeats(robot, found)
+        _check_nodes(found)
+        climbs += _climbs(robot, found, counts, timeout_s)
         for_all(links, lambda index, _: climbs[index].prepare())
         for link in links:
             link.command(identifiers.NMT_START)
         modes = [climb.run() for climb in climbs]
-        _check_restarts(found)
+        _check_nodes(found)
     except HalError:  # a bus that went down included
         for climb in climbs:
             climb.give_up()
@@ -138,6 +149,7 @@ def boot_network(
                 mode=mode,
                 position_counts=stand,
                 position=position,
+                foreign=identity.foreign,
                 notes=note,
             )
             for link, identity, mode, stand, position, note in zip(
@@ -161,29 +173,36 @@ def _rejoin(found: FoundNodes) -> None:
         link.boot_ups = found.boot_ups[index]
 
 
-def _check_restarts(found: FoundNodes) -> None:
+def _check_nodes(found: FoundNodes) -> None:
     for link, boot_ups in zip(found.links, found.boot_ups, strict=True):
         if link.boot_ups > boot_ups:
             raise BootError(f"{link.where}: was reset during the boot; check its supply, or for another NMT master")
+        if link.echoes > ECHOES:
+            raise BootError(
+                f"{link.where}: {link.echoes:.0%} of the SDO requests were answered twice;"
+                " give each device a node id of its own"
+            )
 
 
-def _configure(robot: RobotDescription, link: NodeLink, joint: Joint) -> tuple[str, ...]:
+def _configure(robot: RobotDescription, link: NodeLink, joint: Joint, identity: NodeIdentity) -> tuple[str, ...]:
     """Write all parameters of one drive; what it did not take but can do without."""
     notes: list[str] = []
     absent: list[str] = []
-    reports_errors = True
-    if is_foreign(joint.drive):
+    reports_errors, foreign = True, identity.foreign
+    if foreign and identity.vendor_id == PROFILE_VENDOR_ID:
+        notes.append(f"{link.where}: {NOT_SIMULATED}")
+    if foreign:
         _settle(link, absent, notes)
         link.read(objects.TORQUE_ACTUAL)  # mapped, so it must be there, with the profile's length
         reports_errors = link.read_optional(objects.ERROR_CODE) is not None
         absent += [] if reports_errors else [f"0x{objects.ERROR_CODE:04X}:0"]
     link.heartbeats = 0
-    for write in communication_writes(robot, joint.drive):
+    for write in communication_writes(robot, foreign=foreign):
         _write(link, write, absent, notes)
-    for plan in pdo_plans(joint.drive, reports_errors=reports_errors):
+    for plan in pdo_plans(joint.drive, foreign=foreign, reports_errors=reports_errors):
         note = set_up_pdo(link, plan)
         notes += [] if note is None else [note]
-    for write in drive_writes(robot, joint):
+    for write in drive_writes(robot, joint, foreign=foreign):
         _write(link, write, absent, notes)
     if absent:
         notes.insert(0, f"{link.where}: the drive works without optional objects: {', '.join(absent)}")
@@ -222,13 +241,13 @@ def _check_position(link: NodeLink, joint: Joint, position: float) -> None:
         )
 
 
-def _await_heartbeats(robot: RobotDescription, links: Sequence[NodeLink]) -> None:
+def _await_heartbeats(robot: RobotDescription, found: FoundNodes) -> None:
     """Hear a heartbeat of every drive of another maker; the profile's own beat in simulated time."""
     wait_s = max(HEARTBEAT_WAIT_S, HEARTBEAT_TOLERANCE * robot.safety.heartbeat_s)
     deadline = time.monotonic() + wait_s
 
     def check(index: int, link: NodeLink) -> None:
-        if not is_foreign(robot.joints[index].drive):
+        if not found.identities[index].foreign:
             return
         if not link.network.wait_until(lambda: link.heartbeats > 0, deadline - time.monotonic()):
             raise BootError(
@@ -236,12 +255,21 @@ def _await_heartbeats(robot: RobotDescription, links: Sequence[NodeLink]) -> Non
                 f" {robot.safety.heartbeat_s * 1e3:g} ms; wrong drive, or check its firmware"
             )
 
-    for_all(links, check)
+    for_all(found.links, check)
 
 
-def _climbs(robot: RobotDescription, links: Sequence[NodeLink], counts: list[int], timeout_s: float) -> list[PowerUp]:
-    own_buses = {joint.drive.bus for joint in robot.joints if not is_foreign(joint.drive)}
+def _climbs(robot: RobotDescription, found: FoundNodes, counts: list[int], timeout_s: float) -> list[PowerUp]:
+    nodes = list(zip(found.links, found.identities, robot.joints, counts, strict=True))
+    own_buses = {joint.drive.bus for _, identity, joint, _ in nodes if not identity.foreign}
     return [
-        PowerUp(link, joint, stand, timeout_s, robot.period_s, may_sync=joint.drive.bus not in own_buses)
-        for link, joint, stand in zip(links, robot.joints, counts, strict=True)
+        PowerUp(
+            link,
+            joint,
+            stand,
+            timeout_s,
+            robot.period_s,
+            foreign=identity.foreign,
+            may_sync=joint.drive.bus not in own_buses,
+        )
+        for link, identity, joint, stand in nodes
     ]

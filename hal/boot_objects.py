@@ -13,7 +13,7 @@ from hal.profile.objects import Pdo, TransmissionType
 from schemas.robot import Drive, Joint, RobotDescription
 
 PROFILE_VENDOR_ID = 0x00000402
-"""Maker of the profile's own drive, which has every object of the EDS; other makers' may lack the optional ones."""
+"""Of the profile's own drive; `hal.find` tells it from others that claim the same."""
 HEARTBEAT_TOLERANCE = 3
 """Missing heartbeats that mean a loss."""
 PDO_RECORDS = 2
@@ -70,17 +70,11 @@ class PdoPlan:
     """Transmission types that do, the best first."""
 
 
-def is_foreign(drive: Drive) -> bool:
-    """Whether a drive is another maker's: it has the objects of the standards alone, and not all of them."""
-    return drive.vendor_id != PROFILE_VENDOR_ID
-
-
-def communication_writes(description: RobotDescription, drive: Drive) -> tuple[SdoWrite, ...]:
+def communication_writes(description: RobotDescription, *, foreign: bool) -> tuple[SdoWrite, ...]:
     """Heartbeats, SYNC period and interpolation period: objects 0x1016, 0x1017, 0x1006, 0x60C2."""
     heartbeat_ms = max(1, round(description.safety.heartbeat_s * 1000.0))
     consumer = identifiers.HAL_NODE_ID << 16 | HEARTBEAT_TOLERANCE * heartbeat_ms
     mantissa, exponent = interpolation_period(description.period_s)
-    foreign = is_foreign(drive)
     if_present, wish = (Need.IF_PRESENT, Need.WISH) if foreign else (Need.ALWAYS, Need.ALWAYS)
     return (
         SdoWrite(objects.PRODUCER_HEARTBEAT_MS, 0, heartbeat_ms),
@@ -91,7 +85,7 @@ def communication_writes(description: RobotDescription, drive: Drive) -> tuple[S
     )
 
 
-def drive_writes(description: RobotDescription, joint: Joint) -> tuple[SdoWrite, ...]:
+def drive_writes(description: RobotDescription, joint: Joint, *, foreign: bool) -> tuple[SdoWrite, ...]:
     """Rated torque 0x6076 [mN·m], its limit 0x6072 [‰], and our maker's firmware parameters 0x2001 to 0x2005.
 
     Another maker's drive may have anything at those indices, and no watchdog: it gets option 0x6007 "quick stop"
@@ -99,7 +93,7 @@ def drive_writes(description: RobotDescription, joint: Joint) -> tuple[SdoWrite,
     """
     drive, safety = joint.drive, description.safety
     rated, limit = round(drive.rated_motor_torque * 1000.0), torque_limit_per_mille(joint)
-    if is_foreign(drive):
+    if foreign:
         need = Need.ALWAYS if drive.kind == "servo" else Need.IF_PRESENT
         return (
             SdoWrite(objects.RATED_TORQUE_MNM, 0, rated, Need.IF_PRESENT),
@@ -123,14 +117,15 @@ def torque_limit_per_mille(joint: Joint) -> int:
     return math.floor(1000.0 * joint.torque_limit / rated * (1.0 + 1e-12))
 
 
-def pdo_plans(drive: Drive, *, reports_errors: bool = True) -> tuple[PdoPlan, ...]:
+def pdo_plans(drive: Drive, *, foreign: bool, reports_errors: bool = True) -> tuple[PdoPlan, ...]:
     """List the PDO records of a drive: those of its kind, and all others invalid.
 
     Args:
         drive: as described.
+        foreign: it is another maker's.
         reports_errors: it has object 0x603F.
     """
-    foreign, node = is_foreign(drive), drive.node_id
+    node = drive.node_id
     rpdos = {pdo.number: pdo for pdo in objects.RPDOS[drive.kind]}
     tpdos = {pdo.number: pdo for pdo in (objects.TPDO_STATE, objects.TPDO_MODE if reports_errors else TPDO_MODE_ALONE)}
     plans: list[PdoPlan] = []

@@ -101,12 +101,14 @@ class BusWatch:
 
     def _hear(self, report: ErrorReport, notices: list[Notice]) -> None:
         text = f"bus {self.name}: {report}"
+        # Of two counters one may be past the passive level and the other past the warning level, in one frame.
+        worse = not {Trouble.BUS_OFF, Trouble.ERROR_PASSIVE}.isdisjoint(report.troubles)
         for trouble in report.troubles:
             if trouble is Trouble.BUS_OFF:
                 self._enter(BusState.OFF, f"{text}; {_ADVICE[BusState.OFF]}", notices)
             elif trouble is Trouble.ERROR_PASSIVE:
                 self._enter(BusState.PASSIVE, f"{text}; {_ADVICE[BusState.PASSIVE]}", notices)
-            elif trouble in _AGAIN and self.state in (BusState.PASSIVE, BusState.OFF):
+            elif trouble in _AGAIN and self.state in (BusState.PASSIVE, BusState.OFF) and not worse:
                 self._leave()
             if trouble in self._warned:
                 continue

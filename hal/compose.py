@@ -74,6 +74,13 @@ class Composer:
         hold = Hold(entry, self._rule.cycles, self._rule.cycles)
         return Setpoint(HAL_DECIDED, ControlMode.POSITION, position, hold=hold)
 
+    def holding(self, position: Array, motor_torque: Array) -> Array:
+        """Targets [rad] at which drives at these positions [rad] go on with the torques [N·m] that they report.
+
+        Their velocity is left out: after an outage it is not known, and the firmware damps it.
+        """
+        return self._rule.target(motor_torque, position, np.zeros_like(position))
+
     def _position(
         self, commanded: Array, previous: Setpoint, predictor: Predictor, delay: int
     ) -> tuple[Limited, Hold | None]:
@@ -89,12 +96,11 @@ class Composer:
         return limited, Hold(entry, self._rule.cycles, self._rule.cycles)
 
 
-def released(setpoint: Setpoint, enabled: Mask, measured: Array) -> Setpoint:
-    """Lead the joints whose drives are not enabled along with where they are, so that enabling one cannot throw it."""
+def placed(setpoint: Setpoint, joints: Mask, targets: Array) -> Setpoint:
+    """Give some joints targets [rad] of their own, without an offset; in torque mode nothing changes."""
     if setpoint.position is None:
         return setpoint
-    position = np.where(enabled, setpoint.position, measured)
     hold = setpoint.hold
     if hold is not None:
-        hold = Hold(np.where(enabled, hold.entry, 0.0), hold.cycles, hold.left)
-    return replace(setpoint, position=position, hold=hold)
+        hold = Hold(np.where(joints, 0.0, hold.entry), hold.cycles, hold.left)
+    return replace(setpoint, position=np.where(joints, targets, setpoint.position), hold=hold)

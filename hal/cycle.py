@@ -10,8 +10,8 @@ import numpy as np
 
 from hal.bus_trouble import BusTrouble
 from hal.commands import CommandCheck
-from hal.compose import Composer, released
-from hal.decode import Decoder, Measured, Notice
+from hal.compose import Composer, placed
+from hal.decode import Decoder, Measured, Notice, upload_request
 from hal.drivers import Controlwords, DriverGroup, operation_mode
 from hal.errors import CommandRefused, DriveFaultError, HalError
 from hal.expected import expected_reports
@@ -19,6 +19,7 @@ from hal.guard import MotionGuard
 from hal.holding import Predictor
 from hal.limits import Onsets
 from hal.profile.cia402 import Controlword, OperationMode
+from hal.profile.objects import MODE_DISPLAY
 from hal.profile.units import Array
 from hal.setpoint import HAL_DECIDED, Setpoint, vector
 from hal.supervision import Supervisor, controlword
@@ -32,6 +33,8 @@ _ExpectedKey = tuple[bool, frozenset[int], frozenset[str], frozenset[int]]
 
 SETTLE_S: Final = 0.1
 """Time that the HAL stays beyond the hold's ramp."""
+UNHEARD_CYCLES: Final = 2
+"""Without a report, after which a drive of a stopped robot is held where it is found."""
 
 
 class HalCore:
@@ -77,17 +80,26 @@ class HalCore:
         self._safe_stop = False
         self._emergency_stop = False
         self._holding = False
+        self._silent_before = np.zeros(len(robot.joints), dtype=np.int64)
+        """Cycles without a report of each drive, at the decode before."""
         self._expected: dict[_ExpectedKey, tuple[frozenset[int], ...]] = {}
         self._trouble = BusTrouble(robot)
         self._reset_joints: set[int] = set()
         """Joints whose drives were reset in operation: what the boot has set is gone, so they are not enabled."""
+        self._lost_joints: set[int] = set()
+        """Joints whose drives were lost or reported an error: none that is off after that is enabled again."""
         self._modes: tuple[ControlMode, ...] = (ControlMode.POSITION,) * len(robot.joints)
         self._states: tuple[DriveState, ...] = (DriveState.OPERATION_ENABLED,) * len(robot.joints)
         self._errors: tuple[int, ...] = (0,) * len(robot.joints)
         self._measured: Measured | None = None
+        self._foreign_joints: frozenset[int] = frozenset()
 
-    def start(self, positions: Array) -> None:
-        """Begin after the boot: every drive in Operation Enabled, mode 8, holding at `positions` [rad].
+    def start(self, positions: Array, foreign_joints: frozenset[int] = frozenset()) -> None:
+        """Begin after the boot: every drive in Operation Enabled, mode 8, holding.
+
+        Args:
+            positions: where the joints stand [rad].
+            foreign_joints: indices of joints with other makers' drives.
 
         Raises:
             HalError: the number of positions is not the number of joints.
@@ -97,6 +109,7 @@ class HalCore:
             raise HalError(
                 f"start with {positions.shape} positions for {len(self.robot.joints)} joints; give one a joint"
             )
+        self._foreign_joints = foreign_joints
         self._decoder = Decoder(self.robot, positions)
         self._predictor = Predictor(positions, self.robot.period_s)
         self._composed = self._sent = self._latched = Setpoint(HAL_DECIDED, ControlMode.POSITION, positions)
@@ -124,11 +137,18 @@ class HalCore:
     @property
     def expected_reports(self) -> tuple[frozenset[int], ...]:
         """Identifiers per bus to await after the SYNC that latches what `apply` sent last; ask before `decode`."""
-        change = operation_mode(self._sent.mode) is not operation_mode(self._latched.mode)
+        # At the first SYNC after the boot a TPDO2 of type 0 is new to its drive and comes as well.
+        change = self._measured is None or operation_mode(self._sent.mode) is not operation_mode(self._latched.mode)
         silent = self._trouble.silent_buses
         key = (change, self._supervisor.silent_joints, self._supervisor.silent_sensors, silent)
         if key not in self._expected:
-            expected = expected_reports(self.robot, mode_change=change, silent_joints=key[1], silent_sensors=key[2])
+            expected = expected_reports(
+                self.robot,
+                mode_change=change,
+                silent_joints=key[1],
+                silent_sensors=key[2],
+                foreign_joints=self._foreign_joints,
+            )
             self._expected[key] = tuple(
                 frozenset() if index in silent else identifiers for index, identifiers in enumerate(expected)
             )
@@ -155,6 +175,8 @@ class HalCore:
         if self._sent.mode is not self._latched.mode:
             self._tell("mode_change", "info", f"mode {self._latched.mode.value} → {self._sent.mode.value}")
         self._latched = self._sent
+        if self._measured is not None:
+            self._silent_before = self._measured.silent_cycles
         measured = self._measured = self._decoder.decode(frames_per_bus)
         self._predictor.update(measured.position, elapsed)
         self._review(measured)
@@ -200,7 +222,10 @@ class HalCore:
         active = self.status is HalStatus.ACTIVE
         self._sent = self._follow(command, arrays, measured) if active else self._hold(measured)
         packets = self._drivers.encode(self._sent, self._controlwords(measured))
-        return self._trouble.asking(packets) if self._trouble.active else packets
+        if self._trouble.active:
+            packets = self._trouble.passing(packets, measured)
+        doubtful = self._supervisor.doubtful_joints
+        return self._asking(packets, doubtful) if doubtful else packets
 
     def stop(self, reason: str, emergency: bool = False) -> None:
         """Stop from the next `apply` on; `emergency` latches until `reset`."""
@@ -231,6 +256,14 @@ class HalCore:
         events, self._events = self._events, []
         return events
 
+    def _asking(self, packets: tuple[bytes, ...], joints: list[int]) -> tuple[bytes, ...]:
+        """Add questions for the modes of some joints' drives."""
+        asked = list(packets)
+        for joint in joints:
+            drive = self.robot.joints[joint].drive
+            asked[self.robot.bus_index(drive.bus)] += upload_request(drive.node_id, MODE_DISPLAY)
+        return tuple(asked)
+
     def _follow(self, command: JointCommand | None, arrays: dict[str, Array] | None, measured: Measured) -> Setpoint:
         self._holding = False
         previous, delay = self._composed, self.robot.command_delay_cycles
@@ -256,10 +289,14 @@ class HalCore:
         self._queue.clear()
         self._holding = True
         held = self._composer.safe(previous, self._predictor)
-        supervisor = self._supervisor
-        all_enabled = supervisor.all_enabled
-        self._composed = held if all_enabled else released(held, supervisor.enabled, measured.position)
-        return self._composed
+        # What a drive did unheard is not known: a target from before would throw its joint back.
+        back = (self._silent_before >= UNHEARD_CYCLES) & (measured.silent_cycles == 0) & self._drivers.reports_torque
+        if np.count_nonzero(back):
+            held = placed(held, back, self._composer.holding(measured.position, measured.motor_torque))
+        if not self._supervisor.all_enabled:  # led along with where they are, so that enabling one cannot throw it
+            held = placed(held, ~self._supervisor.enabled, measured.position)
+        self._composed = held
+        return held
 
     def _checked(self, command: JointCommand) -> dict[str, Array] | None:
         try:
@@ -298,6 +335,7 @@ class HalCore:
         if self._trouble.active:
             ages = self._trouble.expected_ages(ages)
         notices = self._supervisor.review(measured, mode, ages)
+        self._lost_joints |= self._supervisor.silent_joints
         if self._latched.mode is ControlMode.TORQUE and self.status is HalStatus.ACTIVE:
             notices += self._guard.review(measured.position, self._predictor.mean_velocity)
         self._act_on(notices, measured)
@@ -306,6 +344,8 @@ class HalCore:
         for notice in notices:
             self._tell(notice.kind, notice.severity, notice.text, notice.joint)
             if notice.stops:
+                if notice.kind in _LOSSES and notice.joint is not None:
+                    self._lost_joints.add(notice.joint)
                 self.cause = self.cause or self._cause(notice, measured)
                 self.stop(notice.text)
 
@@ -319,8 +359,10 @@ class HalCore:
     def _controlwords(self, measured: Measured) -> Controlwords:
         if self._supervisor.all_enabled and not self._reset_joints:
             return self._all_enabled
-        keep = self._emergency_stop
-        words = [controlword(DriveState(state), keep=keep) for state in measured.drive_state.tolist()]
+        words = [
+            controlword(DriveState(state), keep=self._emergency_stop or joint in self._lost_joints)
+            for joint, state in enumerate(measured.drive_state.tolist())
+        ]
         for joint in self._reset_joints:
             words[joint] = Controlword.DISABLE_VOLTAGE
         return np.array(words, dtype=np.uint16)
@@ -363,3 +405,5 @@ class HalCore:
 
 
 _STATES = tuple(DriveState)
+_LOSSES: Final = frozenset({"node_lost", "drive_emergency"})
+"""Kinds of notices after which a drive's power stage is left to whoever boots it again."""

@@ -94,7 +94,7 @@ class Measured:
     errors: tuple[tuple[int, ErrorReport], ...]
     """Index of the bus and content of each error frame of its controller."""
     answered: frozenset[int]
-    """Joints whose mode came by SDO in this cycle (see `mode_requests`)."""
+    """Joints whose mode came by SDO in this cycle (see `upload_request`)."""
     reset: frozenset[int]
     """Joints whose drives have announced their boot-up in this cycle."""
 
@@ -359,9 +359,6 @@ class Decoder:
         self._kind[row], self._index[row], self._length[row] = kind, index, length
 
 
-def mode_requests(node_id: int) -> bytes:
-    """SDO upload requests for mode display and error code, which a drive's TPDO2 tells on change alone."""
-    return b"".join(
-        pack(identifiers.SDO_RX + node_id, _SDO_HEAD.pack(_UPLOAD, index, 0) + bytes(4))
-        for index in (MODE_DISPLAY, ERROR_CODE)
-    )
+def upload_request(node_id: int, index: int) -> bytes:
+    """Frame that asks a node for an object by SDO; `Measured.answered` tells of the answer to 0x6061."""
+    return pack(identifiers.SDO_RX + node_id, _SDO_HEAD.pack(_UPLOAD, index, 0) + bytes(4))

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-from hal.boot_objects import is_foreign, torque_limit_per_mille
+from hal.boot_objects import torque_limit_per_mille
 from hal.bus.errors import BusError
 from hal.errors import BootError
 from hal.node_link import NodeLink
@@ -47,6 +47,8 @@ class PowerUp:
     """Where it stands [counts]: its first target."""
     timeout_s: float
     period_s: float
+    foreign: bool
+    """The drive is another maker's."""
     may_sync: bool
     """All drives of its bus are of other makers, so that a SYNC during the boot does no harm."""
     by_pdo: bool = False
@@ -58,8 +60,9 @@ class PowerUp:
         The profile's drive that is enabled already holds by its own means, and a target would be a command. Another
         maker's has an old target, which it must not follow in the new mode.
         """
-        link, foreign = self.link, is_foreign(self.joint.drive)
+        link, foreign = self.link, self.foreign
         if foreign:
+            self.counts = link.read(objects.POSITION_ACTUAL)  # one that is enabled already may have moved meanwhile
             link.write(objects.TARGET_POSITION, 0, self.counts)
         link.write(objects.MODE, 0, OperationMode.CSP)
         if self._state() is not DriveState.OPERATION_ENABLED:
@@ -92,7 +95,7 @@ class PowerUp:
                 self._wait(since, now, command)
             else:
                 since, before = now, state
-                if command == Controlword.ENABLE_OPERATION and is_foreign(self.joint.drive):
+                if command == Controlword.ENABLE_OPERATION and self.foreign:
                     self._follow()
                 if state is DriveState.FAULT:
                     if faulty_until:

@@ -11,12 +11,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
+from hal.boot_objects import PROFILE_VENDOR_ID
 from hal.bus.errors import BusError, BusOverflowError
 from hal.bus.ports import FramePort
 from hal.errors import BootError, HalError, NodesMissingError
-from hal.node_link import NodeLink, PortNetwork
+from hal.node_link import NodeLink
 from hal.profile import identifiers, objects
 from hal.profile.cia402 import SUPPORTED_MODES, Controlword
+from hal.sdo_client import PortNetwork
 from schemas.robot import Joint, RobotDescription
 
 ASK_S: Final = 2.0
@@ -31,13 +33,18 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True)
 class NodeIdentity:
-    """What one node says of itself: objects 0x1000, 0x1018, 0x6502."""
+    """What one node says of itself: objects 0x1000, 0x1018, 0x6502, and 0x2006 of what claims to be the profile's."""
 
     device_type: int
     vendor_id: int
     product_code: int
     supported_modes: int
     """Bit n − 1 stands for mode n."""
+    foreign: bool
+    """Not the profile's own, simulated drive: it lives in wall-clock time and has the standards' objects at most.
+
+    The vendor id alone does not tell: a device made after the profile's EDS may have it too.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,4 +187,5 @@ def _identify(link: NodeLink, joint: Joint) -> NodeIdentity:
             f"{link.where}: object 0x6502 is 0x{supported:08X}, a {joint.drive.kind} drive needs 0x{needed:08X}"
             " (bit n-1 for mode n)"
         )
-    return NodeIdentity(device_type, vendor_id, product_code, supported)
+    own = vendor_id == PROFILE_VENDOR_ID and link.peek(objects.TIME_BASE) == objects.TimeBase.SIMULATION
+    return NodeIdentity(device_type, vendor_id, product_code, supported, foreign=not own)

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from hal.boot import boot_network
-from hal.boot_objects import is_foreign
 from hal.bus.address import MAX_PACKET
 from hal.bus.error_frames import BUS_OFF
 from hal.bus.errors import BusDownError, BusStuckError
@@ -60,7 +59,7 @@ class Master:
         self._heartbeat_cycles = max(1, round(robot.safety.heartbeat_s * robot.rate_hz))
         self._heartbeat_due = 0
         """Sequence from which on the next heartbeat is sent: SYNCs may be left out."""
-        self._foreign = any(is_foreign(joint.drive) for joint in robot.joints)
+        self._foreign = False
         """Some drive lives in wall-clock time, however slow a lockstep cycle is, and wants its heartbeats there."""
         self._heartbeat_due_s = 0.0
         self._received: list[list[bytes]] = [[] for _ in ports]
@@ -91,7 +90,9 @@ class Master:
             report = boot_network(self._robot, self._ports, timeout_s, self._found)
         except BootError as error:
             raise self._reason(error) from error
-        self.core.start(np.array(report.position_measured))
+        foreign = frozenset(index for index, drive in enumerate(report.drives) if drive.foreign)
+        self._foreign = bool(foreign)
+        self.core.start(np.array(report.position_measured), foreign)
         return report.notes
 
     def sync(self, sequence: int) -> None:
@@ -114,7 +115,7 @@ class Master:
         """Await all reports of this SYNC, up to a time, and decode them; what is missing becomes an event."""
         self._missing = [set(expected) for expected in self.core.expected_reports]
         if any(self._missing):
-            self._group.gather(self._take, timeout_s)
+            self._await_reports(timeout_s)
         else:
             self._take_waiting()
         return self.core.decode(sequence, [b"".join(received) for received in self._received])
@@ -126,6 +127,14 @@ class Master:
             for index, packet in enumerate(packets):
                 if part := packet[start : start + self._turn_bytes]:
                     self._send(index, part)
+
+    def keep_alive(self) -> None:
+        """Send a heartbeat when other makers' drives want one by the wall clock; for whoever waits long."""
+        now = time.monotonic()
+        if self._foreign and now >= self._heartbeat_due_s:
+            self._heartbeat_due_s = now + HEARTBEAT_SHARE * self._robot.safety.heartbeat_s
+            for index in range(len(self._ports)):
+                self._send(index, self._heartbeat)
 
     def drops(self) -> list[tuple[str, dict[str, int]]]:
         """Name the buses whose interfaces or sockets have dropped frames since the last call, with the counts."""
@@ -144,6 +153,18 @@ class Master:
         """Leave the buses."""
         self._group.close()
 
+    def _await_reports(self, timeout_s: float) -> None:
+        if not self._foreign:
+            self._group.gather(self._take, timeout_s)
+            return
+        deadline = time.monotonic() + timeout_s
+        while True:
+            now = time.monotonic()
+            remaining = max(0.0, deadline - now)
+            if self._group.gather(self._take, min(remaining, max(0.0, self._heartbeat_due_s - now))) or not remaining:
+                return
+            self.keep_alive()
+
     def _take_waiting(self) -> None:
         for index, frames in self._group.receive(0.0):
             self._take(index, frames)
@@ -151,15 +172,15 @@ class Master:
     def _take(self, index: int, packet: bytes) -> bool:
         """Keep what came on a bus; whether nothing is awaited any more on any."""
         missing = self._missing[index]
+        down = self._ports[index].down
         if packet:
             self._received[index].append(packet)
             identifiers = can_ids(packet)
             missing.difference_update(identifiers)
             if max(identifiers) >= CAN_ERR_FLAG and any(map(_is_bus_off, identifiers)):
                 missing.clear()
-        else:  # the interface has just gone down
-            port = self._ports[index]
-            self._lose(index, port.down or f"bus {port.name}: the interface went down")
+        if down is not None or not packet:  # the interface has just gone down; what came before may be with it
+            self._lose(index, down or f"bus {self._ports[index].name}: the interface went down")
             missing.clear()
         return not any(self._missing)
 

@@ -10,6 +10,7 @@ from typing import Final
 from hal.bus.counters import describe
 from hal.bus.errors import BusLostError
 from hal.bus.ports import open_port
+from hal.bus.socketcan import ROOM_S, ROOM_SHARE
 from hal.errors import HalError, NodesMissingError
 from hal.filters import hal_filters
 from hal.master import Master
@@ -207,6 +208,7 @@ class HalService:
         while life.signalled is None:
             remaining = deadline - time.monotonic()
             data = self._commands.receive(min(max(remaining, 0.0), LOOK_UP_S))
+            self._master.keep_alive()
             self._serve_operator()
             life.check_peers()
             if data is not None:
@@ -286,7 +288,8 @@ def run_hal(run: Run, options: ServiceOptions) -> int:
     needed = tuple(peer for peer in ("plant", "controller") if peer in options.peers)
     with Lifecycle(open_service("hal", run, options), needed) as life:
         patience_s = max(CONNECT_S, CONNECT_SHARE * time.process_time())
-        ports = [open_port(bus, patience_s, hal_filters(robot, bus.name)) for bus in robot.buses]
+        room_s = ROOM_SHARE * robot.period_s if run.scenario.clock is Clock.REALTIME else ROOM_S
+        ports = [open_port(bus, patience_s, hal_filters(robot, bus.name), room_s) for bus in robot.buses]
         master = Master(robot, ports, options.session)
         try:
             service = HalService(run, master, life)

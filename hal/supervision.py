@@ -15,6 +15,8 @@ from schemas.robot import RobotDescription
 Mask = npt.NDArray[np.bool_]
 
 _ENABLED = int(DriveState.OPERATION_ENABLED)
+DOUBT_CYCLES: Final = 2
+"""In another mode than commanded, after each of which a drive is asked: some stacks leave TPDO2 to the application."""
 
 
 class Supervisor:
@@ -44,6 +46,14 @@ class Supervisor:
     def silent_sensors(self) -> frozenset[str]:
         """Sensors without a whole reading for `sync_timeout_cycles`."""
         return self._silent_sensors
+
+    @property
+    def doubtful_joints(self) -> list[int]:
+        """Joints whose drives are to be asked for their mode now: none, as long as all modes reported are right."""
+        if self._right is not None:
+            return []
+        joints: list[int] = np.flatnonzero((self._wrong_mode > 0) & (self._wrong_mode % DOUBT_CYCLES == 0)).tolist()
+        return joints
 
     def excuse(self, joints: Mask) -> None:
         """Name the joints whose bus is in trouble: that they are silent, or in an old mode, is not told."""
@@ -143,7 +153,10 @@ _COMMANDED: Final = (
 
 
 def controlword(state: DriveState, *, keep: bool) -> int:
-    """Controlword for a drive of a stopped robot; `keep`: an emergency stop powers nothing up before its reset."""
+    """Controlword for a drive of a stopped robot; `keep`: nothing is powered up.
+
+    So it is in an emergency stop before its reset, and for a drive that was lost or has reported an error.
+    """
     if state is DriveState.QUICK_STOP_ACTIVE:
         return Controlword.QUICK_STOP  # "disable voltage" would cut the ramp short
     if state not in _COMMANDED:

@@ -6,7 +6,7 @@ from typing import Final, Protocol
 
 from hal.profile.frames import CAN_ERR_FLAG, split, unpack
 from hal.profile.identifiers import SYNC
-from plant_service.wire import Origin, Transmitted, Wire
+from plant_service.wire import Origin, Transmitted, Wire, carries_process_data
 
 SYNC_HEAD: Final = SYNC.to_bytes(4, "little") + b"\0"
 
@@ -171,13 +171,12 @@ class TimedBus:
 
     def _pass(self, transmitted: Transmitted, sent: list[bytes], now_ns: int) -> None:
         """Let a frame that was on the bus reach those it is for."""
-        frame, identifier = transmitted.frame, transmitted.identifier
-        if transmitted.origin is not Origin.OUTSIDE:
+        frame, identifier, origin, end_ns = transmitted
+        if origin is not Origin.OUTSIDE:
             sent.append(frame)
             self._awaited.discard(identifier)
             return
-        end_ns = transmitted.end_ns
-        if is_sync(frame):
+        if identifier == SYNC and is_sync(frame):
             self._sync_waits = False
             for answer in self._nodes.sync(now_ns):
                 self._awaited.add(_identifier(answer))
@@ -190,6 +189,11 @@ class TimedBus:
 def is_sync(frame: bytes) -> bool:
     """Whether a frame is a SYNC: one with data is none."""
     return frame[:5] == SYNC_HEAD
+
+
+def is_process_data(frame: bytes) -> bool:
+    """Whether a frame is of no service that is answered: nobody misses it before the next SYNC."""
+    return carries_process_data(int.from_bytes(frame[:4], "little"))
 
 
 def _identifier(frame: bytes) -> int:

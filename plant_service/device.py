@@ -34,6 +34,7 @@ from schemas.messages import DriveState
 K_STATUSWORD = key_of(objects.STATUSWORD)
 K_POSITION_ACTUAL = key_of(objects.POSITION_ACTUAL)
 K_TORQUE_DEMAND = key_of(objects.TORQUE_DEMAND)
+K_TIME_BASE = key_of(objects.TIME_BASE)
 K_SUPPORTED = key_of(objects.SUPPORTED_DRIVE_MODES)
 K_ERROR_BEHAVIOUR = key_of(objects.ERROR_BEHAVIOUR, 1)
 LENGTH_ERRORS: Final = (EmergencyCode.PDO_LENGTH, EmergencyCode.PDO_LENGTH_EXCEEDED, EmergencyCode.SYNC_LENGTH)
@@ -47,7 +48,7 @@ class DriveDevice(CanopenNode):
     def __init__(
         self, node_id: int, axis: Axis, fixed: Mapping[int, int] | None = None, eds: Path | None = None
     ) -> None:
-        super().__init__(node_id, fixed, eds)
+        super().__init__(node_id, {K_TIME_BASE: objects.TimeBase.SIMULATION} | dict(fixed or {}), eds)
         self._axis = axis
         self.power = Power(self._values, axis, self._values[K_SUPPORTED])
         self._watchdogs = Watchdogs(self._values)

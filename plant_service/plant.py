@@ -11,7 +11,7 @@ from typing import Final
 from hal.profile import objects
 from hal.profile.cia402 import SUPPORTED_MODES
 from hal.profile.frames import split
-from plant_service.bus_nodes import BusNodes, Device, TimedBus, UntimedBus, is_sync
+from plant_service.bus_nodes import BusNodes, Device, TimedBus, UntimedBus, is_process_data, is_sync
 from plant_service.device import DriveDevice
 from plant_service.errors import PlantError
 from plant_service.object_dictionary import key_of
@@ -103,10 +103,13 @@ class Plant:
     def set_bus_down(self, index: int, down: bool) -> None:
         """Take a bus away or bring it back: one that is down carries nothing and is not waited for."""
         self._down[index] = down
+        wire = self._wires[index]
         if down:
-            for bus in (self._boot[index], self._wires[index]):
-                if bus is not None:
-                    bus.clear()
+            self._boot[index].clear()
+            if wire is not None:
+                wire.clear()
+        elif wire is not None:
+            wire.wire.resume(self._now_ns)
 
     def deliver(self, bus_index: int, packet: bytes, after_ns: int = 0) -> bytes:
         """Give frames of a bus to it; the frames of its nodes that were on the bus meanwhile.
@@ -131,6 +134,7 @@ class Plant:
         if syncs:
             self._check_order(bus_index, syncs)
         answers = []
+        asked = False
         for frame in frames:
             if is_sync(frame):
                 answers.append(self._sync(bus_index, wire, frame))
@@ -138,7 +142,9 @@ class Plant:
                 answers.append(self._boot[bus_index].exchange(frame, self._now_ns))
             else:
                 wire.put(frame, self._command_ns if self._synced[bus_index] else self._last_command_ns)
-        if self._started[bus_index]:
+                asked = asked or not is_process_data(frame)
+        # Process data waits for the rest of its cycle, so that it contends with all of it, however packets are cut.
+        if asked:
             answers.append(wire.run(self._next_sync_ns(bus_index) - 1, self._now_ns))
         return b"".join(answers)
 
@@ -196,9 +202,14 @@ class Plant:
         self._statistics_due_ns = now_ns + STATISTICS_NS
         sequence, time_ns = max(self.sequence, 0), now_ns - self._origin_ns
         messages = []
-        for bus, wire in zip(self._robot.buses, self._wires, strict=True):
-            if wire is not None:
-                messages.append(wire.wire.statistics.take(bus.name, sequence, time_ns, final=final))
+        for index, (bus, wire) in enumerate(zip(self._robot.buses, self._wires, strict=True)):
+            if wire is None:
+                continue
+            if final:
+                if not self._free:
+                    wire.run(self._next_sync_ns(index) - 1, now_ns)
+                wire.wire.end(now_ns)
+            messages.append(wire.wire.statistics.take(bus.name, sequence, time_ns))
         return tuple(message for message in messages if message is not None)
 
     @property

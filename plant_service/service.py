@@ -8,10 +8,11 @@ from typing import Final
 
 from hal.bus.counters import describe
 from hal.bus.error_frames import split_errors
-from hal.bus.errors import BusStuckError
+from hal.bus.errors import BusOverflowError, BusStuckError
 from hal.bus.gather import PortGroup
 from hal.bus.hub import BusHub
 from hal.bus.ports import DropCounting, FramePort, open_port
+from hal.bus.socketcan import ROOM_S, ROOM_SHARE
 from hal.profile.frames import FRAME_BYTES, can_ids
 from hal.profile.identifiers import SYNC
 from plant_service.plant import Plant, SyncOrderError
@@ -57,6 +58,8 @@ class PlantService:
         for key in (self._truth_key, *self._load_keys.values()):
             life.transport.declare_publisher(key)
         self._down = [False] * len(self._names)
+        self._full = [False] * len(self._names)
+        """Of these, buses that took no frames: they are back when they take one."""
         self._sync_missing = False
         """Some bus goes without SYNC while another has it; told once."""
         self._count_due_s = 0.0
@@ -177,13 +180,13 @@ class PlantService:
             port = self._buses.ports[index]
             if not packet or port.down is not None:
                 self._lose(index, port.down or f"bus {port.name}: the interface went down")
-            elif self._down[index]:
+            elif self._down[index] and not self._full[index]:
                 self._regain(index)
             if frames := split_errors(packet)[0]:
                 arrived.append((index, frames))
         for index, port in enumerate(self._buses.ports):
             # In lockstep a bus counts again with its next SYNC: until then the master may not know that it is back.
-            if self._down[index] and self._realtime and port.down is None:
+            if self._down[index] and port.down is None and self._realtime and not self._full[index]:
                 self._regain(index)
         if time.monotonic() >= self._count_due_s:
             self._count_drops()
@@ -218,6 +221,10 @@ class PlantService:
                 self._buses.ports[index].send(packet)
             except BusStuckError as error:
                 self._lose(index, str(error))
+                self._full[index] = isinstance(error, BusOverflowError)
+            else:
+                if self._full[index]:
+                    self._regain(index)
 
     def _lose(self, index: int, reason: str) -> None:
         """Go on without a bus: its drives hear nothing, and hold by their own means."""
@@ -227,7 +234,7 @@ class PlantService:
             self._life.event("bus_down", reason, "warning")
 
     def _regain(self, index: int) -> None:
-        self._down[index] = False
+        self._down[index] = self._full[index] = False
         self._plant.set_bus_down(index, False)
         self._life.event("bus_recovered", f"bus {self._names[index]}: works again")
 
@@ -278,7 +285,9 @@ def run_plant(run: Run, options: ServiceOptions) -> int:
     """
     # Before the buses: whoever finds a bus finds its nodes.
     plant = Plant(run, free=run.scenario.clock is Clock.REALTIME)
-    buses = PortGroup([_open(bus.of_plant()) for bus in run.robot.description.buses])
+    robot = run.robot.description
+    room_s = ROOM_SHARE * robot.period_s if run.scenario.clock is Clock.REALTIME else ROOM_S
+    buses = PortGroup([_open(bus.of_plant(), room_s) for bus in robot.buses])
     try:
         with Lifecycle(open_service("plant", run, options), needed=("hal",)) as life:
             service = PlantService(run, plant, buses, life)
@@ -292,13 +301,13 @@ def run_plant(run: Run, options: ServiceOptions) -> int:
     return 0
 
 
-def _open(bus: Bus) -> FramePort:
+def _open(bus: Bus, room_s: float) -> FramePort:
     """Host a virtual bus, join any other.
 
     No filters: what a master sends is meant for some drive, whose identifiers it may change, and the plant's own frames
     do not come back.
     """
-    return BusHub(bus.channel, bus.name) if bus.interface == "cosim" else open_port(bus)
+    return BusHub(bus.channel, bus.name) if bus.interface == "cosim" else open_port(bus, room_s=room_s)
 
 
 def _parts(packet: bytes) -> Iterator[bytes]:

@@ -3,19 +3,19 @@
 A frame waits in its sender's mailbox from the time it is ready. Whenever the bus is idle, the lowest identifier of
 those ready goes (non-preemptive) and takes its bits, stuffed by its real content (`hal.profile.bits`). A sender has one
 mailbox an identifier: a newer frame replaces an older one that still waits, so that an overloaded bus starves instead
-of queueing without end. NMT, EMCY, SDO and heartbeat messages do not supersede one another: they queue, up to `QUEUE`.
+of queueing without end. NMT, EMCY and SDO messages do not supersede one another: they queue, up to `QUEUE`.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
 from heapq import heappop, heappush
-from typing import Final, NamedTuple
+from typing import Final
 
 from hal.profile.bits import frame_bits
 from hal.profile.frames import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_RTR_FLAG, CAN_SFF_MASK
 from hal.profile.identifiers import EMCY, HEARTBEAT, NMT, SDO_RX, SDO_TX, SYNC
-from plant_service.wire_statistics import WireStatistics
+from plant_service.wire_statistics import Account, WireStatistics
 
 QUEUE: Final = 64
 """Messages of one kind that a sender keeps waiting before the oldest gives way."""
@@ -40,25 +40,20 @@ OUTSIDE: Final = Origin.OUTSIDE
 ANSWER: Final = Origin.ANSWER
 
 
-class Transmitted(NamedTuple):
-    """A frame that was on the bus."""
-
-    frame: bytes
-    identifier: int
-    """With the flags of `struct can_frame`."""
-    origin: Origin
-    end_ns: int
+Transmitted = tuple[bytes, int, Origin, int]
+"""A frame that was on the bus: (frame, identifier with the flags of `struct can_frame`, origin, end_ns)."""
 
 
 class _Mailbox:
     """Of one sender and identifier; queued messages have several, in turn."""
 
-    __slots__ = ("arbitration", "holds", "identifier", "is_data")
+    __slots__ = ("account", "arbitration", "holds", "identifier", "is_data")
 
-    def __init__(self, identifier: int) -> None:
+    def __init__(self, identifier: int, account: Account) -> None:
         self.identifier = identifier
+        self.account = account
         self.arbitration = _arbitration(identifier)
-        self.is_data = identifier != SYNC and not _queues(identifier)
+        self.is_data = carries_process_data(identifier)
         """Process data, which a SYNC can overtake."""
         self.holds: _Waiting | None = None
         """The frame that contends; None: empty."""
@@ -96,12 +91,16 @@ class Wire:
     def begin(self, now_ns: int) -> None:
         """Begin a cycle: the time at which its SYNC is ready, from which completions count."""
         self._cycle_ns = now_ns
-        self.statistics.begin(now_ns)
+        self.statistics.begin(now_ns, self.idle_ns)
+
+    def end(self, now_ns: int) -> None:
+        """End the last cycle: no SYNC is to come."""
+        self.statistics.end(now_ns, self.idle_ns)
 
     def put(self, frame: bytes, ready_ns: int, origin: Origin) -> None:
         """Give a frame to its sender's mailbox, to contend from `ready_ns` on."""
         self._order = order = self._order + 1
-        identifier = frame[0] | frame[1] << 8 | frame[2] << 16 | frame[3] << 24
+        identifier = int.from_bytes(frame[:4], "little")
         key = identifier << 1 | (origin is OUTSIDE)
         mailbox = self._mailboxes.get(key)
         if mailbox is None:
@@ -115,7 +114,8 @@ class Wire:
         if not contending:
             if not future:
                 return None
-            start_ns = max(start_ns, future[0][0])
+            if future[0][0] > start_ns:
+                start_ns = future[0][0]
         if start_ns > last_start_ns:
             return None
         while future and future[0][0] <= start_ns:
@@ -124,15 +124,14 @@ class Wire:
             if mailbox.holds is None:
                 heappush(contending, (mailbox.arbitration, waiting[1], mailbox))
             else:
-                self.statistics.account(mailbox.identifier).replaced += 1
+                mailbox.account.replaced += 1
             mailbox.holds = waiting
         mailbox = heappop(contending)[2]
         sent, mailbox.holds = mailbox.holds, None
         assert sent is not None  # a mailbox contends while it holds a frame
         ready_ns, _, _, frame, origin, syncs, cycle_ns = sent
         end_ns = self.idle_ns = start_ns + round(frame_bits(frame) * self._bit_ns)
-        statistics = self.statistics
-        account = statistics.account(mailbox.identifier)
+        statistics, account = self.statistics, mailbox.account
         account.add(start_ns - ready_ns)
         statistics.busy_ns += end_ns - start_ns
         if mailbox.is_data:
@@ -141,7 +140,11 @@ class Wire:
             statistics.completed(end_ns - cycle_ns, origin is OUTSIDE, origin is ANSWER)
         elif mailbox.identifier == SYNC:
             self._syncs += 1
-        return Transmitted(frame, mailbox.identifier, origin, end_ns)
+        return frame, mailbox.identifier, origin, end_ns
+
+    def resume(self, now_ns: int) -> None:
+        """Carry frames again, no earlier than now: what was put meanwhile contends, the newest of each mailbox."""
+        self.idle_ns = max(self.idle_ns, now_ns)
 
     def clear(self) -> None:
         """Forget what waits: the bus is down."""
@@ -155,18 +158,19 @@ class Wire:
             key |= (order % QUEUE + 1) << 33
             if key in self._mailboxes:
                 return self._mailboxes[key]
-        mailbox = self._mailboxes[key] = _Mailbox(identifier)
+        mailbox = self._mailboxes[key] = _Mailbox(identifier, self.statistics.account(identifier))
         return mailbox
+
+
+def carries_process_data(identifier: int) -> bool:
+    """Whether an identifier is of process data: neither a SYNC nor a heartbeat nor a message that queues."""
+    is_heartbeat = HEARTBEAT <= identifier < HEARTBEAT + NODES
+    return identifier != SYNC and not is_heartbeat and not _queues(identifier)
 
 
 def _queues(identifier: int) -> bool:
     """Whether frames of an identifier are messages of their own, of which none replaces another."""
-    return (
-        SDO_TX <= identifier < SDO_RX + NODES
-        or EMCY < identifier < EMCY + NODES
-        or HEARTBEAT <= identifier < HEARTBEAT + NODES
-        or identifier == NMT
-    )
+    return SDO_TX <= identifier < SDO_RX + NODES or EMCY < identifier < EMCY + NODES or identifier == NMT
 
 
 def _arbitration(identifier: int) -> int:

@@ -27,6 +27,10 @@ class Account:
         if wait_ns > self.wait_max_ns:
             self.wait_max_ns = wait_ns
 
+    def clear(self) -> None:
+        """Begin anew."""
+        self.frames = self.late = self.replaced = self.wait_ns = self.wait_max_ns = 0
+
     def summary(self, can_id: int) -> FrameStatistics:
         """As a message."""
         return FrameStatistics(
@@ -47,6 +51,7 @@ class WireStatistics:
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
+        self._accounts: dict[int, Account] = {}
         self.busy_ns = 0
         """Of the cycle in course."""
         self._begun_ns: int | None = None
@@ -54,7 +59,8 @@ class WireStatistics:
 
     def _restart(self) -> None:
         """Forget what has been told; the cycle in course goes on."""
-        self._accounts: dict[int, Account] = {}
+        for account in self._accounts.values():
+            account.clear()
         self._cycles = 0
         self._busy_total_ns = 0
         self._time_total_ns = 0
@@ -63,7 +69,7 @@ class WireStatistics:
         self._command_end_ns = 0
 
     def account(self, can_id: int) -> Account:
-        """Give the sums of one identifier, to add to."""
+        """Give the sums of one identifier, to add to; they stay the same object."""
         account = self._accounts.get(can_id)
         if account is None:
             account = self._accounts[can_id] = Account()
@@ -77,20 +83,26 @@ class WireStatistics:
         elif is_report and end_ns > self._report_end_ns:
             self._report_end_ns = end_ns
 
-    def begin(self, now_ns: int) -> None:
-        """End the cycle in course and begin another."""
+    def begin(self, now_ns: int, idle_ns: int) -> None:
+        """End the cycle in course and begin another, which has the rest of a frame on the bus until `idle_ns`."""
+        rest_ns = max(0, idle_ns - now_ns)
         if self._begun_ns is None:
-            self.busy_ns = 0  # the boot is no cycle
-            self._restart()
+            self._restart()  # the boot is no cycle
         else:
+            self.busy_ns -= rest_ns
             self._end_cycle(now_ns - self._begun_ns)
-        self._begun_ns = now_ns
+        self._begun_ns, self.busy_ns = now_ns, rest_ns
 
-    def take(self, bus: str, sequence: int, time_ns: int, *, final: bool = False) -> BusStatistics | None:
-        """Sum up the cycles that have ended since the last call, with `final` the one in course too; None: no cycle."""
-        if final and self._begun_ns is not None:
-            self._end_cycle(0)
+    def end(self, now_ns: int, idle_ns: int) -> None:
+        """End the cycle in course: no SYNC is to come. What the frame on the bus takes after it is of no cycle."""
+        if self._begun_ns is not None:
+            end_ns = max(now_ns, self._begun_ns + self._period_ns)
+            self.busy_ns -= max(0, idle_ns - end_ns)
+            self._end_cycle(end_ns - self._begun_ns)
             self._begun_ns = None
+
+    def take(self, bus: str, sequence: int, time_ns: int) -> BusStatistics | None:
+        """Sum up the cycles that have ended since the last call; None: no cycle."""
         if not self._cycles:
             return None
         message = BusStatistics(
@@ -102,7 +114,11 @@ class WireStatistics:
             load_max=self._load_max,
             report_end_max_s=self._report_end_ns * NANO,
             command_end_max_s=self._command_end_ns * NANO,
-            frames=tuple(account.summary(can_id) for can_id, account in sorted(self._accounts.items())),
+            frames=tuple(
+                account.summary(can_id)
+                for can_id, account in sorted(self._accounts.items())
+                if account.frames or account.replaced
+            ),
         )
         self._restart()
         return message

@@ -134,8 +134,8 @@ class BusLoad:
 class CyclePlan:
     """The worst cycle of a robot over all its buses: slowest reports, computing, slowest commands.
 
-    With a command delay of 2 commands may be on the bus during the next cycle's reports; a bus whose load is at most
-    100 % carries both within that period, so that the sum of the three remains the condition.
+    With a command delay of 2 commands go out after the reports of the next cycle, those of all buses: a bus whose load
+    is at most 100 % carries both within that period, unless it waits for the reports of a slower one (`crowded`).
     """
 
     loads: tuple[BusLoad, ...]
@@ -167,6 +167,11 @@ class CyclePlan:
     def in_time(self) -> bool:
         """Commands arrive before the SYNC that latches them."""
         return self.needed_s <= self.available_s * (1.0 + ROUNDING)
+
+    @property
+    def crowded(self) -> bool:
+        """Slowest reports and slowest commands, of different buses, do not fit into the period that they share."""
+        return self.report_time_s + self.command_time_s > self.period_s * (1.0 + ROUNDING)
 
     @property
     def blocking_s(self) -> float:
@@ -214,7 +219,7 @@ class CyclePlan:
         ways = ["lower rate_hz", "move joints or sensors to another bus"]
         if not self.overloaded:
             ways = ["lower compute_budget_s or rate_hz", "spread joints over buses"]
-            if self.needed_s <= 2.0 * self.period_s and self.command_delay_cycles == 1:
+            if self.needed_s <= 2.0 * self.period_s and self.command_delay_cycles == 1 and not self.crowded:
                 ways.append("set command_delay_cycles to 2")
         return ", ".join(ways)
 

@@ -244,7 +244,7 @@ def _ends_with_magic(path: Path) -> bool:
     try:
         with path.open("rb") as stream:
             start = stream.read(len(MCAP0_MAGIC))
-            stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+            stream.seek(-len(start), os.SEEK_END)
             end, length = stream.read(), stream.tell()
     except OSError as error:
         raise LogError(f"{path}: cannot read the log: {error.strerror or error}") from error

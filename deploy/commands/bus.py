@@ -75,6 +75,7 @@ def bus(
     stats: Annotated[bool, typer.Option("--stats", help="Load of each bus, and counts by identifier.")] = False,
     dbc: Annotated[bool, typer.Option("--dbc", help="Print the DBC file of a bus; with --to: write it.")] = False,
     clock: opt.Clock = None,
+    allow_overload: opt.AllowOverload = False,
     base_port: opt.BasePort = None,
     json_: opt.Json = False,
 ) -> None:
@@ -89,7 +90,7 @@ def bus(
 
     if sum((stats, dbc, only is not None)) > 1 or (to is not None and (stats or only)):
         raise UsageError("give one of --only, --stats, --dbc; --to goes with --dbc or alone")
-    run = opt.resolve_run(scenario, None, clock=clock) if scenario is not None else None
+    run = opt.resolve_run(scenario, None, clock=clock, allow_overload=allow_overload) if scenario is not None else None
     place = find_place(source, robot, run, base_port)
     if dbc:
         _write_dbc(place.robot, bus, to)
@@ -185,7 +186,7 @@ def _show_statistics(feed: Feed, count: int | None, json_: bool) -> None:
     if json_:
         opt.print_json(report.as_json())
         return
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 120)
     for heading, table in report.tables():
         console.print(heading, highlight=False)
         console.print(table)

@@ -12,8 +12,15 @@ import can
 
 from hal.bus.address import MAX_PACKET, connect
 from hal.bus.can_frame import decode, encode, split
-from hal.bus.errors import BusError, BusLostError, BusOverflowError, BusStuckError, BusUnavailableError
-from hal.bus.socketcan import open_socketcan
+from hal.bus.errors import (
+    BusDownError,
+    BusError,
+    BusLostError,
+    BusOverflowError,
+    BusStuckError,
+    BusUnavailableError,
+)
+from hal.bus.socketcan import ROOM_S, open_socketcan
 from hal.profile.frames import FRAME_BYTES
 from schemas.robot import Bus
 
@@ -75,15 +82,12 @@ class CosimPort:
         """Send n × 16 bytes as one packet (several beyond 512 frames)."""
         if len(frames) % FRAME_BYTES:
             raise BusError(f"bus {self.name}: {len(frames)} bytes are not whole frames of {FRAME_BYTES} bytes")
+        start = 0
         try:
-            if len(frames) <= MAX_PACKET:
-                if frames:
-                    self._socket.send(frames, _NOW)
-            else:
-                for start in range(0, len(frames), MAX_PACKET):
-                    self._socket.send(frames[start : start + MAX_PACKET], _NOW)
+            for start in range(0, len(frames), MAX_PACKET):
+                self._socket.send(frames[start : start + MAX_PACKET], _NOW)
         except BlockingIOError as error:
-            raise BusOverflowError(f"bus {self.name}: its host has stopped to read; frames are lost") from error
+            raise BusOverflowError(f"bus {self.name}: its host has stopped to read; frames are lost", start) from error
         except OSError as error:
             raise BusLostError(f"bus {self.name} has gone: {error.strerror}") from error
 
@@ -127,12 +131,16 @@ class CosimPort:
 
 
 class PythonCanPort:
-    """Any python-can bus as a port; error and remote frames keep their flags."""
+    """Any python-can bus as a port; error and remote frames keep their flags.
 
-    down: str | None = None
+    python-can does not tell a full queue from an adapter that was pulled out: an error is a state of the port and not
+    its end, so that whoever has other buses goes on with them.
+    """
 
     def __init__(self, name: str, bus: can.BusABC) -> None:
         self.name = name
+        self.down: str | None = None
+        """Why the last transmission, or reception, failed."""
         self._bus = bus
         try:
             self._descriptor = bus.fileno()
@@ -140,25 +148,32 @@ class PythonCanPort:
             self._descriptor = NO_DESCRIPTOR
 
     def send(self, frames: bytes) -> None:
-        """Send n × 16 bytes, a message each."""
+        """Send n × 16 bytes, a message each.
+
+        Raises:
+            BusDownError: python-can cannot send now; what is left of the packet is lost.
+        """
         if len(frames) % FRAME_BYTES:
             raise BusError(f"bus {self.name}: {len(frames)} bytes are not whole frames of {FRAME_BYTES} bytes")
-        try:
-            for frame in split(frames):
+        for number, frame in enumerate(split(frames)):
+            try:
                 self._bus.send(decode(frame))
-        except can.CanError as error:
-            raise BusLostError(f"bus {self.name} has gone: {error}") from error
+            except (can.CanError, OSError) as error:
+                self.down = f"bus {self.name}: python-can cannot send: {error}"
+                raise BusDownError(self.down, number * FRAME_BYTES) from error
+        if frames:
+            self.down = None
 
     def receive(self, timeout_s: float) -> bytes:
-        """All that waits, b"" after `timeout_s` [s]."""
+        """All that waits, b"" after `timeout_s` [s] or while `down`."""
         received = []
         try:
             message = self._bus.recv(max(0.0, timeout_s))
             while message is not None:
                 received.append(encode(message))
                 message = self._bus.recv(0.0)
-        except can.CanError as error:
-            raise BusLostError(f"bus {self.name} has gone: {error}") from error
+        except (can.CanError, OSError) as error:
+            self.down = f"bus {self.name}: python-can cannot receive: {error}"
         return b"".join(received)
 
     def fileno(self) -> int:
@@ -246,7 +261,10 @@ class RecordingPort:
 
 
 def open_port(
-    bus: Bus, connect_timeout_s: float = 2.0, filters: Sequence[can.typechecking.CanFilter] | None = None
+    bus: Bus,
+    connect_timeout_s: float = 2.0,
+    filters: Sequence[can.typechecking.CanFilter] | None = None,
+    room_s: float = ROOM_S,
 ) -> FramePort:
     """Open a bus of a robot description: `cosim` and `socketcan` directly, every other interface by python-can.
 
@@ -254,6 +272,7 @@ def open_port(
         bus: of the description.
         connect_timeout_s: time [s] for a virtual bus to appear.
         filters: of frames to receive, applied by the kernel (`socketcan`); on other interfaces all frames pass.
+        room_s: longest wait [s] for room in a full transmit queue (`socketcan`): the other buses wait as well.
 
     Raises:
         BusUnavailableError: nobody hosts the virtual bus, the kernel's interface is absent or down, or python-can
@@ -263,7 +282,7 @@ def open_port(
     if bus.interface == "cosim":
         return CosimPort(bus.name, bus.channel, connect_timeout_s)
     if bus.interface == "socketcan":
-        return open_socketcan(bus, filters)
+        return open_socketcan(bus, filters, room_s)
     try:
         return PythonCanPort(bus.name, can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate))
     except (can.CanError, OSError, ValueError, ImportError) as error:

@@ -25,7 +25,9 @@ from hal.profile.frames import FRAME_BYTES
 from schemas.robot import Bus
 
 ROOM_S: Final = 0.05
-"""Longest wait for room in a full transmit queue, whose ten frames take 9 ms at 125 kbit/s."""
+"""Wait for room in a full transmit queue where the cycle waits for all; its ten frames take 9 ms at 125 kbit/s."""
+ROOM_SHARE: Final = 0.5
+"""The same in realtime, as a share of the period: the other buses must have their SYNCs in time."""
 ROOM_STEP_S: Final = 0.0002
 MOST_FRAMES: Final = 1024
 """Taken in one call of `receive`, so that a flood cannot keep it."""
@@ -61,7 +63,13 @@ class SocketCanPort:
     """A `FramePort` on a kernel CAN interface."""
 
     def __init__(
-        self, name: str, channel: str, bus: RawBus, reopen: Reopen | None = None, pacer: WirePacer | None = None
+        self,
+        name: str,
+        channel: str,
+        bus: RawBus,
+        reopen: Reopen | None = None,
+        pacer: WirePacer | None = None,
+        room_s: float = ROOM_S,
     ) -> None:
         """Take over an open bus.
 
@@ -71,12 +79,14 @@ class SocketCanPort:
             bus: opened by python-can.
             reopen: opens it again when the interface has been taken out and put in again.
             pacer: of bursts; None where the interface keeps all that it is given.
+            room_s: longest wait [s] for room in a full transmit queue.
         """
         self.name = name
         self.channel = channel
         self._bus = bus
         self._reopen = reopen
         self._pacer = pacer
+        self._room_s = room_s
         self._socket = bus.socket
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         self._index = _index_of(channel)
@@ -154,7 +164,7 @@ class SocketCanPort:
                 return
             now = time.monotonic()
             # A queue that stayed full once is not waited for again: the other buses must go on.
-            deadline = (now if self._full else now + ROOM_S) if deadline is None else deadline
+            deadline = (now if self._full else now + self._room_s) if deadline is None else deadline
             if now >= deadline:
                 self._full = True
                 raise BusOverflowError(
@@ -224,12 +234,15 @@ class SocketCanPort:
         return True
 
 
-def open_socketcan(bus: Bus, filters: Sequence[can.typechecking.CanFilter] | None = None) -> SocketCanPort:
+def open_socketcan(
+    bus: Bus, filters: Sequence[can.typechecking.CanFilter] | None = None, room_s: float = ROOM_S
+) -> SocketCanPort:
     """Open a kernel CAN interface by python-can.
 
     Args:
         bus: of the robot description; its bit rate paces bursts on hardware, where it must be the interface's own.
         filters: python-can's, applied by the kernel; None lets all frames pass.
+        room_s: longest wait [s] for room in a full transmit queue.
 
     Raises:
         BusUnavailableError: the kernel has no CAN, or the interface is absent or down.
@@ -259,7 +272,7 @@ def open_socketcan(bus: Bus, filters: Sequence[can.typechecking.CanFilter] | Non
             f"{where} is down; `ip link set {bus.channel} up type can bitrate {bus.bitrate}` (vcan: without type)"
         )
     pacer = WirePacer(bus.bitrate) if is_hardware(bus.channel) else None
-    return SocketCanPort(bus.name, bus.channel, opened, open_bus, pacer)
+    return SocketCanPort(bus.name, bus.channel, opened, open_bus, pacer, room_s)
 
 
 def is_hardware(interface: str, directory: str = "/sys/class/net") -> bool:

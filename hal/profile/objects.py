@@ -70,11 +70,21 @@ WATCHDOG_CYCLES: Final = 0x2004
 """Maker's, U16: SYNC periods without SYNC or RPDO after which the drive holds by itself; 0 is off."""
 HOLD_RAMP_MS: Final = 0x2005
 """Maker's, U16: time over which a held torque offset ramps to zero."""
+TIME_BASE: Final = 0x2006
+"""Maker's, U8: see `TimeBase`."""
 
 
 def entry(index: int, subindex: int, bits: int) -> int:
     """Build the mapping entry of a PDO: index << 16 | subindex << 8 | bits (CiA 301 section 7.5.2.36)."""
     return index << 16 | subindex << 8 | bits
+
+
+class TimeBase:
+    """Values of object 0x2006."""
+
+    WALL_CLOCK: Final = 0
+    SIMULATION: Final = 1
+    """The drive's time is that of the simulation, which stands still before the first SYNC of a lockstep run."""
 
 
 class TransmissionType:

@@ -51,6 +51,15 @@ def up(folder: Path, *more: str, duration: str = "0.5") -> Said:
     return call(*line, *more)
 
 
+def direct(folder: Path) -> list[Said]:
+    """The same run in one process: the project's tests hold it equal to the virtual bus, which takes twice the time."""
+    code = (
+        "from pathlib import Path; from deploy.runner import run_to_log; from schemas.load import load_run;"
+        f" run_to_log(load_run({SCENARIO!r}, {{'duration_s': 0.5}}), Path({str(folder / 'direct')!r}))"
+    )
+    return [call("python", "-c", code)]
+
+
 def virtual(folder: Path) -> list[Said]:
     """The reference: the project's own virtual bus."""
     return [up(folder / "virtual")]
@@ -79,13 +88,26 @@ def alone(folder: Path) -> list[Said]:
     return [call("cosim", "hal", "--scenario", SCENARIO, "--bus", VCAN, "--peers", "hal")]
 
 
+def visitor(folder: Path) -> list[Said]:
+    """Drives of another maker on vcan, from a process that shares no code with ours; no plant."""
+    robots = Path("tests/data/robots")
+    slaves = [sys.executable, "-m", "tests.hal.foreign_slave", "--channel", "vcan0", "--lely"]
+    with subprocess.Popen([*slaves, "--robot", str(robots / "visitor.yaml")], stdout=subprocess.PIPE, text=True) as far:
+        assert far.stdout is not None
+        far.stdout.readline()
+        line = ("cosim", "up", str(robots / "visitor-greet.yaml"), "--no-plant", "--no-plots")
+        said = call(*line, "--out", str(folder / "visitor"))
+        far.terminate()
+    return [said]
+
+
 def kernel_tests(folder: Path) -> list[Said]:
     """Tests that need a kernel with CAN."""
-    return [call("python", "-m", "pytest", "-q", "-rs", "--capture=sys", f"--basetemp={folder}/tests", *KERNEL_TESTS)]
+    return [call("python", "-m", "pytest", "-q", "-rs", *KERNEL_TESTS)]
 
 
 RUNS: dict[str, Callable[[Path], list[Said]]] = {
-    run.__name__: run for run in (virtual, vcan, kvaser, alone, kernel_tests)
+    run.__name__: run for run in (direct, virtual, vcan, kvaser, alone, visitor, kernel_tests)
 }
 
 

@@ -98,6 +98,11 @@ def test_statistics_of_a_log(capsys: pytest.CaptureFixture[str]) -> None:
     assert 0.2 < bus["load_mean"] < bus["load_max"] < 1.0
 
 
+def test_a_robot_whose_buses_are_overloaded_can_be_watched(capsys: pytest.CaptureFixture[str]) -> None:
+    robot = str(Path(__file__).parents[1] / "data" / "robots" / "arm9-one-bus.yaml")
+    assert "BO_ 393 wrist_roll_TPDO1" in run(capsys, "--dbc", "--robot", robot)
+
+
 def test_a_dbc_is_printed_or_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     printed = run(capsys, "--dbc", "--robot", "arm9", "--bus", "arm9-0")
     assert "BO_ 385 scapula_yaw_TPDO1: 8 scapula_yaw" in printed

@@ -27,7 +27,7 @@ def test_all_wrong_drives_are_named() -> None:
 
 
 def test_a_drive_that_does_not_answer_is_told_from_a_missing_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hal.node_link.SDO_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("hal.sdo_client.SDO_TIMEOUT_S", 0.05)
     with pytest.raises(BootError, match=r"joint2 .*SDO read of 0x1000:0 failed .*check the drive's power"):
         boot(wire(Habits(), Habits(answers=False)))
 

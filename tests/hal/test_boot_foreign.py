@@ -10,7 +10,7 @@ import pytest
 from hal.boot import boot_network
 from hal.errors import BootError
 from hal.profile.frames import pack
-from tests.hal.foreign_device import ENABLED, FAULT
+from tests.hal.foreign_device import ENABLED, FAULT, ForeignSlave
 from tests.hal.foreign_objects import GENERAL, NO_OBJECT, READ_ONLY, UNSUPPORTED, VALUE, Habits, Item, lely_like
 from tests.hal.foreign_robot import NODES, Wire, boot, foreign_robot, wire
 
@@ -192,6 +192,30 @@ def test_a_drive_that_restarts_during_the_boot_is_refused(when: bytes) -> None:
     assert_off(bus)
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.003])
+def test_two_drives_with_one_node_id_are_refused(delay_s: float) -> None:
+    bus = Wire([ForeignSlave(1, Habits()), ForeignSlave(1, Habits(position=500, answer_s=delay_s))])
+    with pytest.raises(BootError, match=r"answered twice; give each device a node id of its own"):
+        boot_network(foreign_robot((1,)), [bus], 1.0)
+    assert not any(slave.enabled_once for slave in bus.slaves)
+
+
+@pytest.mark.parametrize("asked", [b"\x40\x64\x60\x00", b"\x40\x18\x10\x01", b"\x40\x77\x77\x00"], ids=bytes.hex)
+def test_answers_to_somebody_else_do_no_harm(asked: bytes) -> None:
+    """Another SDO client asks the drive now and then: for its position, its vendor, an object that it does not have."""
+    bus, requests = wire(Habits(), Habits()), 0
+
+    def deliver(frames: bytes) -> bytes:
+        nonlocal requests
+        requests += 1
+        another = bus.answer(pack(0x601, asked.ljust(8, b"\0"))) if requests % 5 == 0 else b""
+        return another + bus.answer(frames)
+
+    bus.intercept(deliver)
+    boot(bus)
+    assert [slave.power for slave in bus.slaves] == [ENABLED, ENABLED]
+
+
 def test_a_joint_that_sags_during_the_boot_is_held_where_it_is() -> None:
     bus = wire(Habits(position=1000))
 
@@ -205,6 +229,25 @@ def test_a_joint_that_sags_during_the_boot_is_held_where_it_is() -> None:
     slave = bus.slaves[0]
     assert slave.objects[0x607A, 0] == report.position_counts[0] < 1000 - 100
     assert abs(slave.objects[0x607A, 0] - slave.objects[0x6064, 0]) <= 9
+
+
+def test_an_enabled_joint_that_moves_is_held_where_it_is_then() -> None:
+    bus = wire(Habits(position=1000))
+    boot(bus)
+    slave = bus.slaves[0]
+    slave.objects[0x6060, 0] = slave.objects[0x6061, 0] = 10  # left in torque mode by a HAL that died
+
+    start = bus.now
+
+    def deliver(frames: bytes) -> bytes:
+        if slave.objects[0x6061, 0] == 10:
+            slave.objects[0x6064, 0] = 1000 - round(2000 * (bus.now - start))
+        return bus.answer(frames)
+
+    bus.intercept(deliver)
+    report = boot(bus)
+    assert slave.objects[0x607A, 0] == report.position_counts[0] < 1000 - 200, "it moves until its mode is set"
+    assert abs(slave.objects[0x607A, 0] - slave.objects[0x6064, 0]) <= 30
 
 
 def test_an_enabled_drive_does_not_follow_an_old_target() -> None:

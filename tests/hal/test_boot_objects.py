@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.boot_objects import (
-    PROFILE_VENDOR_ID,
     Need,
     SdoWrite,
     communication_writes,
@@ -22,16 +21,8 @@ from schemas.robot import Drive
 from tests.hal.robots import robot
 
 
-def drive(kind: str, vendor_id: int = 0x402) -> Drive:
-    return Drive(
-        kind=kind,
-        bus="b",
-        node_id=4,
-        rated_motor_torque=0.5,
-        position_gain=1.0,
-        velocity_gain=0.0,
-        vendor_id=vendor_id,
-    )
+def drive(kind: str) -> Drive:
+    return Drive(kind=kind, bus="b", node_id=4, rated_motor_torque=0.5, position_gain=1.0, velocity_gain=0.0)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +43,7 @@ def test_interpolation_period_fits_its_object_and_is_near(period_s: float) -> No
 
 @pytest.mark.parametrize(("kind", "valid"), [("position_pd", [0x204]), ("torque", [0x204, 0x304]), ("servo", [0x204])])
 def test_the_pdos_of_each_kind(kind: str, valid: list[int]) -> None:
-    plans = {plan.name: plan for plan in pdo_plans(drive(kind))}
+    plans = {plan.name: plan for plan in pdo_plans(drive(kind), foreign=False)}
     assert list(plans) == ["TPDO1", "RPDO1", "TPDO2", "RPDO2"]
     assert [plan.cob_id for name, plan in plans.items() if name[0] == "R" and plan.pdo is not None] == valid
     assert {name: (plan.communication, plan.mapping) for name, plan in plans.items()} == {
@@ -66,7 +57,7 @@ def test_the_pdos_of_each_kind(kind: str, valid: list[int]) -> None:
 
 
 def test_another_makers_presets_are_not_used_and_its_types_are_tried() -> None:
-    plans = {plan.name: plan for plan in pdo_plans(drive("torque", vendor_id=0x1234))}
+    plans = {plan.name: plan for plan in pdo_plans(drive("torque"), foreign=True)}
     assert [name for name, plan in plans.items() if plan.pdo is None] == ["TPDO3", "RPDO3", "TPDO4", "RPDO4"]
     assert plans["TPDO1"].types == (1,), "the cycle is built on reports at each SYNC"
     assert plans["TPDO2"].types == (1, 0, 255, 254)
@@ -74,20 +65,23 @@ def test_another_makers_presets_are_not_used_and_its_types_are_tried() -> None:
 
 
 def test_another_makers_drive_gets_no_parameter_of_ours() -> None:
-    def writes(kind: str, vendor_id: int) -> dict[int, SdoWrite]:
-        description = robot(kind, drive={"vendor_id": vendor_id})
+    def writes(kind: str, *, foreign: bool) -> dict[int, SdoWrite]:
+        description = robot(kind)
         joint = description.joints[0]
-        every = [*communication_writes(description, joint.drive), *drive_writes(description, joint)]
+        every = [
+            *communication_writes(description, foreign=foreign),
+            *drive_writes(description, joint, foreign=foreign),
+        ]
         return {write.index: write for write in every}
 
-    own, foreign = writes("torque", PROFILE_VENDOR_ID), writes("torque", 0xFB)
+    own, foreign = writes("torque", foreign=False), writes("torque", foreign=True)
     assert [index for index in own if 0x2000 <= index < 0x6000] == [0x2001, 0x2002, 0x2003, 0x2004, 0x2005]
     assert [index for index in foreign if 0x2000 <= index < 0x6000] == []
     assert {write.need for write in own.values()} == {Need.ALWAYS}
     assert [index for index, write in foreign.items() if write.need is Need.ALWAYS] == [0x1017]
     assert [index for index, write in foreign.items() if write.need is Need.WISH] == [0x1006, 0x6007]
     assert foreign[0x6007].value == 3  # quick stop when the heartbeat is missing
-    assert writes("servo", 0xFB)[0x6072].need is Need.ALWAYS, "it is part of the servo's command"
+    assert writes("servo", foreign=True)[0x6072].need is Need.ALWAYS, "it is part of the servo's command"
 
 
 @given(st.floats(0.01, 30.0), st.integers(1, 5000), st.floats(20.0, 300.0))

@@ -19,17 +19,33 @@ from hal.profile.frames import pack
 from plant_service.plant import Plant
 from schemas.load import load_run
 from schemas.messages import DriveState, HalStatus
-from schemas.robot import Bus
+from schemas.robot import Bus, Safety
 from tests.hal.durand_drive import DurandDrive
 from tests.hal.foreign_device import ENABLED, FAULT, OPERATIONAL
-from tests.hal.foreign_objects import Habits, lely_like
+from tests.hal.foreign_objects import Habits, Item, lely_like
 from tests.hal.foreign_robot import NODES, Cycle, foreign_robot, wire
 
 LELY = {"vendor_id": 0x360, "product_code": 1}
+OUR_IDS = {"vendor_id": 0x402, "product_code": 1}
+"""Those of the simulated drives, and the robot description's defaults."""
+OUR_MAKERS_OBJECTS = {
+    **{(index, 0): Item(4) for index in (0x2001, 0x2002, 0x2003)},
+    **{(index, 0): Item(2) for index in (0x2004, 0x2005)},
+    (0x2006, 0): Item(1, 0, "ro"),
+}
+"""As in our EDS."""
 MAKERS = pytest.mark.parametrize(
     ("habits", "identity"),
-    [(Habits(), {}), (lely_like(), LELY), (Habits(lacks=frozenset({0x603F, 0x1016, 0x6076}), samples_first=True), {})],
-    ids=["usual", "lely-like", "meagre"],
+    [
+        (Habits(), {}),
+        (lely_like(), LELY),
+        (Habits(lacks=frozenset({0x603F, 0x1016, 0x6076}), samples_first=True), {}),
+        (lely_like(**OUR_IDS), OUR_IDS),
+        (lely_like(lacks=frozenset(), objects=OUR_MAKERS_OBJECTS, pdo_records=2, **OUR_IDS), OUR_IDS),
+        (lely_like(objects={(0x2006, 0): Item(4, 1)}, **OUR_IDS), OUR_IDS),
+        (lely_like(types=frozenset({0, 1, 255}), objects={(0x1801, 2): Item(1, 0, "ro")}), LELY),
+    ],
+    ids=["usual", "lely-like", "meagre", "our ids", "our EDS", "our ids, its own 0x2006", "never tells a change"],
 )
 
 
@@ -77,6 +93,19 @@ def test_a_drive_that_restarts_in_operation_stops_the_robot(habits: Habits, iden
     assert (lost[0].joint, lost[0].severity) == ("joint2", "error")
     assert "the drive was reset during operation" in lost[0].text
     assert [slave.power == ENABLED for slave in bus.slaves] == [True, False, True]
+
+
+def test_a_silent_drive_does_not_keep_the_heartbeat_from_the_others() -> None:
+    bus = wire(Habits(), Habits())
+    robot = foreign_robot(NODES[:2], safety=Safety(heartbeat_s=0.02))
+    master = Master(robot, [bus], "test")
+    master.boot(2.0)
+    bus.STEP_S = 0.0002  # no faster than the wall clock, by which the HAL sends its heartbeats
+    cycle = Cycle(master, robot, timeout_s=0.3)
+    cycle.run(3, position=(0.0, 0.0))
+    bus.unplugged.add(2)
+    cycle.run(2, position=(0.0, 0.0))
+    assert bus.slaves[0].power == ENABLED, "it misses the HAL after 60 ms"
 
 
 def test_a_fault_in_operation_is_not_reset_by_the_cycle() -> None:

@@ -11,12 +11,15 @@ import pytest
 from hal.bus.errors import BusDownError
 from hal.bus.ports import DirectPort
 from hal.master import Master
+from hal.profile import objects
+from hal.profile.cia402 import OperationMode
 from hal.profile.frames import can_ids, pack, unpack
 from hal.profile.identifiers import HEARTBEAT, SDO_RX, SYNC
 from plant_service.plant import Plant, SyncOrderError
 from schemas.base import ControlMode
 from schemas.load import load_run
 from schemas.messages import DriveState, Event, HalStatus, JointCommand, RobotState
+from tests.hal.robots import report
 
 BUS_OFF = pack(0x20000040, bytes(8))
 RESTARTED = pack(0x20000100, bytes(8))
@@ -51,7 +54,7 @@ class Interface(DirectPort):
 
 
 class Robot:
-    """arm9 with its master, in torque mode at the torques that hold it."""
+    """arm9 with its master, in position mode unless told otherwise."""
 
     def __init__(self) -> None:
         self.run = load_run("arm9-transition", {"duration_s": 60.0})
@@ -75,17 +78,20 @@ class Robot:
             self.plant.advance()
             return self.plant.deliver(index, packet)
 
-    def cycle(self) -> RobotState:
+    def cycle(self, torque: tuple[float, ...] | None = None) -> RobotState:
+        """One period, commanded to stay, or in torque mode to give a torque [N·m]."""
         self.master.sync(self.sequence)
         state = self.master.gather(self.sequence, 0.0)
+        self.truth = self.plant.truth()
         if self.plant.sync_complete:
             self.plant.advance()
         command = JointCommand(
             session="me",
             sequence=self.sequence,
             time_ns=0,
-            mode=ControlMode.POSITION,
+            mode=ControlMode.POSITION if torque is None else ControlMode.TORQUE,
             position=state.applied.position or state.position_measured,
+            torque=torque,
         )
         self.master.apply(command)
         self.sequence += 1
@@ -97,6 +103,15 @@ class Robot:
         for _ in range(count):
             state = self.cycle()
         return state
+
+    @property
+    def nodes(self) -> list[int]:
+        """Node ids on the bus in trouble."""
+        return [self.run.robot.description.joints[joint].drive.node_id for joint in self.joints]
+
+    def commanded(self) -> list[int]:
+        """Nodes that the last cycle's RPDOs on the bus in trouble were for."""
+        return [can_id & 0x7F for can_id, _ in unpack(self.sent[LEFT_OUT]) if can_id & ~0x7F in (0x200, 0x300)]
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.events]
@@ -164,12 +179,13 @@ def test_modes_are_asked_for_when_a_bus_works_again(robot: Robot) -> None:
     robot.cycles(3)
     robot.ports[LEFT_OUT].is_down = False
     asked: list[int] = []
-    for _ in range(10):
+    for _ in range(40):
         robot.cycle()
-        asked += [can_id for can_id, _ in unpack(robot.sent[LEFT_OUT]) if can_id & 0x780 == SDO_RX]
+        now = [can_id for can_id, _ in unpack(robot.sent[LEFT_OUT]) if can_id & 0x780 == SDO_RX]
+        assert len(now) == len(set(now)), "an SDO server takes one request at a time"
+        asked += now
         assert not any(can_id & 0x780 == SDO_RX for can_id, _ in unpack(robot.sent[0]))
-    nodes = [robot.run.robot.description.joints[joint].drive.node_id for joint in robot.joints]
-    assert sorted(asked) == sorted(2 * [SDO_RX + node for node in nodes])
+    assert sorted(asked) == sorted(2 * [SDO_RX + node for node in robot.nodes])
 
 
 def test_a_drive_that_was_reset_is_not_enabled_again(robot: Robot) -> None:
@@ -184,12 +200,56 @@ def test_a_drive_that_was_reset_is_not_enabled_again(robot: Robot) -> None:
     assert "node_lost" in robot.kinds()
     assert "bus_recovered" not in robot.kinds()
     assert robot.core.troubled_buses == ("arm9-1",)
+    assert robot.commanded() == [each for each in robot.nodes if each != node], "it does not report"
+    # Somebody starts it: it reports, and is told to stay off.
+    robot.ports[LEFT_OUT].inject(report(node, statusword=0x0250))
+    robot.cycle()
     words = {
         int.from_bytes(data[:2], "little")
         for can_id, data in unpack(robot.sent[LEFT_OUT])
         if can_id in (0x200 + node, 0x300 + node)
     }
     assert words == {0x00}
+
+
+def test_a_bus_that_comes_back_gets_no_command_before_its_drives_have_reported(robot: Robot) -> None:
+    robot.ports[LEFT_OUT].is_down = True
+    robot.cycles(3)
+    robot.master.sync(robot.sequence)
+    robot.master.gather(robot.sequence, 0.0)
+    robot.ports[LEFT_OUT].is_down = False
+    robot.master.apply(None)
+    sent = robot.master.frames(robot.sequence)[LEFT_OUT].sent
+    assert [can_id for can_id, _ in unpack(sent)] == []
+    robot.plant.advance()
+    robot.sequence += 1
+    robot.cycle()
+    assert robot.commanded() == robot.nodes
+
+
+def test_a_joint_that_moved_unheard_is_held_where_it_is_found(robot: Robot) -> None:
+    """Drives without a watchdog of their own go on with the last torque while nobody hears them."""
+    joint = robot.joints[-1]
+    for each in robot.joints:
+        robot.plant.drives[each].dictionary.write(objects.WATCHDOG_CYCLES, 0, bytes(2))
+    steady = np.array(robot.cycle().motor_torque_measured)
+    steady[joint] += 5.0
+    for _ in range(30):
+        robot.cycle(tuple(steady.tolist()))
+    lost_at = robot.truth.position[joint]
+    robot.ports[LEFT_OUT].is_down = True
+    robot.cycles(60)
+    robot.ports[LEFT_OUT].is_down = False
+    robot.cycle()
+    found_at = robot.truth.position[joint]
+    assert abs(found_at - lost_at) > np.radians(0.5)
+    torques = []
+    for _ in range(100):
+        robot.cycle()
+        torques.append(robot.truth.motor_torque[joint])
+    assert robot.truth.mode[joint] == OperationMode.CSP
+    assert max(np.abs(torques)) < 40.0, "no more than what stops it; the target from before asks for 160 N·m"
+    assert abs(robot.truth.position[joint] - found_at) < np.radians(0.1)
 
 
 def test_all_buses_down_and_up_again(robot: Robot) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from hal.bus.error_frames import ErrorReport, Trouble
+from hal.bus.error_frames import ErrorReport, Trouble, decode_error
 from hal.bus_watch import BusState, BusWatch
+from hal.profile.frames import pack
 
 PATIENCE = 5
 
@@ -44,6 +45,13 @@ def test_a_controllers_trouble_stops_once_and_ends_by_its_word(
     assert bus.recovered().kind == "bus_recovered"
     assert not bus.troubled
     assert kinds(bus, trouble) == [(kind, True)], "the next onset is told again"
+
+
+def test_one_counter_past_its_warning_does_not_make_up_for_the_other_past_the_passive_level() -> None:
+    bus = watch()
+    report = decode_error(pack(0x20000004, bytes.fromhex("0024000000000000")))  # transmit passive, receive warning
+    assert next(notice.kind for notice in bus.review([report], True, None)) == "bus_error_passive"
+    assert bus.state is BusState.PASSIVE
 
 
 @pytest.mark.parametrize("trouble", [Trouble.BUS_OFF, Trouble.ERROR_PASSIVE])

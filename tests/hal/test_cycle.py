@@ -354,6 +354,29 @@ def test_a_disabled_drive_is_enabled_where_it_stands() -> None:
     assert close(loop.target(), [0.27])
 
 
+def test_a_drive_that_was_lost_is_not_enabled_again() -> None:
+    loop = Loop("torque", positions=[0.3])
+    loop.cycle(P, position=(0.3,))
+    loop.silent = {0}
+    for _ in range(loop.robot.safety.sync_timeout_cycles):
+        loop.cycle()
+    loop.silent = set()
+    words = []
+    for statusword in (ENABLED, 0x0640, 0x0621, 0x0623, ENABLED):
+        loop.statusword[0] = statusword
+        loop.cycle()
+        words.append(loop.sent[-1][0x201][0])
+    assert words == [0x0F, 0x00, 0x06, 0x07, 0x0F], "it is left as it is; one that holds goes on holding"
+
+
+def test_a_drive_that_reports_an_error_is_not_enabled_again() -> None:
+    loop = Loop("torque", positions=[0.3])
+    loop.cycle(P, position=(0.3,))
+    loop.statusword[0] = 0x0640
+    loop.extra[0] = frame(0x081, bytes.fromhex("3081100000000000"))
+    assert [loop.cycle() and loop.sent[-1][0x201][0] for _ in range(3)] == [0x00] * 3
+
+
 def test_a_silent_drive_is_told_at_once_and_stops_after_the_timeout() -> None:
     loop = Loop()
     loop.cycle(P, position=(0.0, 0.0))

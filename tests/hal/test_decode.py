@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hal.bus.error_frames import Trouble
-from hal.decode import Decoder, mode_requests
+from hal.decode import Decoder, upload_request
 from hal.errors import HalError, ProfileError
 from hal.profile.frames import unpack
 from schemas.messages import DriveState
@@ -157,11 +157,8 @@ def test_error_frames_are_handed_out_with_their_bus() -> None:
 
 def test_mode_and_error_come_by_sdo_as_well() -> None:
     unit = decoder("torque", "torque")
-    requests = list(unpack(mode_requests(2)))
-    assert requests == [
-        (0x602, bytes.fromhex("4061600000000000")),
-        (0x602, bytes.fromhex("403F600000000000")),
-    ]
+    assert list(unpack(upload_request(2, 0x6061))) == [(0x602, bytes.fromhex("4061600000000000"))]
+    assert list(unpack(upload_request(2, 0x603F))) == [(0x602, bytes.fromhex("403F600000000000"))]
     answers = frame(0x582, bytes.fromhex("4F61600008000000")) + frame(0x582, bytes.fromhex("4B3F600005730000"))
     before = unit.decode([report(1), report(2) + mode_report(2, 10)])
     assert before.mode.tolist() == [8, 10]

@@ -185,6 +185,41 @@ def test_it_does_not_matter_whether_a_command_is_read_before_another_bus_has_its
     assert observed[0] == observed[1]
 
 
+@pytest.mark.parametrize("size", [1, 2, 5, 9])
+def test_how_commands_are_cut_into_packets_does_not_matter_on_an_overloaded_bus(size: int) -> None:
+    """A kernel interface gives them one by one, a virtual bus as many as wait: they contend all the same."""
+
+    def observe(size: int) -> object:
+        arm = Arm(on_one_bus())
+        seen = arm.sync()
+        for per_mille in range(5):
+            data = struct.pack("<Hbh", 0x0F, 10, per_mille)
+            frames = [pack(0x300 + node, data) for node in reversed(arm.nodes[0])]
+            for begin in range(0, len(frames), size):
+                arm.plant.deliver(0, b"".join(frames[begin : begin + size]))
+            seen += arm.sync()
+        return seen, arm.plant.statistics(final=True)
+
+    assert observe(size) == observe(9)
+
+
+def test_heartbeats_that_do_not_fit_before_the_commands_yield_to_them() -> None:
+    """The drives' heartbeats are due at one time; of those that wait when commands are ready one at most goes first."""
+    arm = Arm(arm9(compute_budget_s=1e-6))
+    for bus, nodes in enumerate(arm.nodes):
+        for node in nodes:
+            request = struct.pack("<BHBI", 0x2B, 0x1017, 0, 10)
+            arm.plant.deliver(bus, pack(0x600 + node, request))
+    for _ in range(20):
+        arm.sync()
+        arm.command()
+    messages = arm.plant.statistics(final=True)
+    frames = {frame.can_id: frame for message in messages for frame in message.frames}
+    assert all(frames[0x700 + node].frames >= 3 for nodes in arm.nodes for node in nodes)
+    for nodes in arm.nodes:
+        assert frames[0x300 + min(nodes)].wait_max_s <= 65e-6
+
+
 def test_a_bus_that_is_down_is_not_waited_for_and_its_drives_hold() -> None:
     arm = Arm(arm9())
     arm.sync()
@@ -204,6 +239,22 @@ def test_a_bus_that_is_down_is_not_waited_for_and_its_drives_hold() -> None:
     assert held == set(arm.nodes[0])
     arm.plant.set_bus_down(0, False)
     assert set(arm.sync()[0]) >= {0x180 + node for node in arm.nodes[0]}
+
+
+def test_a_bus_that_comes_back_does_not_pour_out_the_heartbeats_of_the_outage() -> None:
+    arm = Arm(arm9())
+    for node in arm.nodes[0]:
+        arm.plant.deliver(0, pack(0x600 + node, struct.pack("<BHBI", 0x2B, 0x1017, 0, 10)))
+    arm.sync()
+    arm.plant.set_bus_down(0, True)
+    for _ in range(200):
+        for bus in (1, 2):
+            arm.plant.deliver(bus, SYNC)
+        arm.plant.advance()
+    arm.plant.set_bus_down(0, False)
+    answers = [can_id for can_id, _ in unpack(arm.plant.deliver(0, SYNC))]
+    assert {0x700 + node for node in arm.nodes[0]} <= set(answers)
+    assert max(answers.count(0x700 + node) for node in arm.nodes[0]) == 1
 
 
 def test_in_real_time_answers_come_when_the_bus_has_carried_them() -> None:

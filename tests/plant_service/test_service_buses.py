@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.bus.errors import BusDownError
+from hal.bus.errors import BusDownError, BusOverflowError
 from hal.bus.gather import PortGroup
 from hal.bus.hub import BusHub
 from hal.bus.ports import CosimPort, FramePort
 from hal.bus.socketcan import open_socketcan
+from hal.decode import upload_request
 from hal.filters import hal_filters
 from hal.master import Master
 from plant_service.plant import Plant
@@ -64,6 +65,17 @@ class Life:
 
     def kinds(self) -> list[str]:
         return [kind for kind, _ in self.events]
+
+
+class FullHub(BusHub):
+    """A bus whose transmit queue may be full."""
+
+    full = False
+
+    def send(self, frames: bytes) -> None:
+        if self.full:
+            raise BusOverflowError(f"bus {self.name}: can7 takes no more frames")
+        super().send(frames)
 
 
 class Card:
@@ -218,3 +230,33 @@ def test_interfaces_of_both_go_down(loop: Loop, away: tuple[int, ...], request: 
     moved = np.abs(np.array(state.position_measured) - np.array(before.position_measured)).max()
     assert moved < np.radians(1.0)
     assert loop.life.kinds().count("bus_recovered") == len(away)
+
+
+def test_a_full_bus_is_told_once_and_is_back_when_it_takes_a_frame(tmp_path: Path) -> None:
+    run = load_run("arm9-transition", {"clock": "realtime", "duration_s": 60.0})
+    hubs = [FullHub(tmp_path / bus.name, bus.name) for bus in run.robot.description.buses]
+    life, buses = Life(), PortGroup(hubs)
+    service = PlantService(run, Plant(run, free=True), buses, life)  # type: ignore[arg-type]  # stand-in
+    node = next(joint.drive.node_id for joint in run.robot.description.joints if joint.drive.bus == hubs[AWAY].name)
+    client = CosimPort("client", hubs[AWAY].path)
+    thread = threading.Thread(target=service.realtime)
+    thread.start()
+
+    def ask(times: int) -> None:
+        for _ in range(times):
+            client.send(upload_request(node, 0x1000))
+            time.sleep(0.005)
+
+    try:
+        hubs[AWAY].full = True
+        ask(20)
+        assert life.kinds() == ["bus_down"]
+        hubs[AWAY].full = False
+        ask(20)
+        assert life.kinds() == ["bus_down", "bus_recovered"]
+        assert client.receive(PATIENCE_S)
+    finally:
+        life.over = True
+        thread.join(10.0)
+        client.close()
+        buses.close()

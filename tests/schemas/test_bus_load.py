@@ -82,6 +82,17 @@ def test_a_second_cycle_of_delay_gives_a_second_period(run: Any) -> None:
     assert replace(plan, command_delay_cycles=2).in_time
 
 
+def test_commands_kept_for_a_cycle_still_share_one_with_the_slowest_reports_of_another_bus(run: Any) -> None:
+    plan = replace(cycle_plan(run.robot.description), command_delay_cycles=2)
+    drives, sensors = plan.loads
+    imus = tuple(("IMU", 8) for _ in range((2000 - 55) // 135))
+    slow = replace(plan, loads=(drives, replace(sensors, reports=imus)))
+    assert slow.fits
+    assert slow.crowded
+    assert not plan.crowded
+    assert "command_delay_cycles" not in replace(slow, command_delay_cycles=1).remedies()
+
+
 def test_what_fits_may_still_not_fit_beside_two_heartbeats(run: Any) -> None:
     plan = cycle_plan(run.robot.description)
     slack_s = plan.available_s - plan.needed_s

@@ -6,9 +6,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import can
 import pytest
 
-from hal.bus.errors import BusLostError, BusUnavailableError
+from hal.bus.errors import BusDownError, BusLostError, BusUnavailableError
 from hal.bus.gather import PortGroup
 from hal.bus.hub import BusHub
 from hal.bus.ports import CosimPort, DirectPort, FramePort, PythonCanPort, RecordingPort, open_port
@@ -125,3 +126,27 @@ def test_what_came_before_the_end_of_a_bus_is_still_received(tmp_path: Path) -> 
     with pytest.raises(BusLostError):
         port.receive(0.5)
     port.close()
+
+
+def test_an_error_of_python_can_is_a_state_that_may_end() -> None:
+    bus = can.Bus(interface="virtual", channel="flaky", receive_own_messages=True)
+    port = PythonCanPort("flaky", bus)
+    send, failing = bus.send, iter([False, True, True])
+
+    def unsteady(message: can.Message, timeout: float | None = None) -> None:
+        if next(failing, False):
+            raise can.CanOperationError("transmit queue full")
+        send(message, timeout)
+
+    bus.send = unsteady  # type: ignore[method-assign]  # an adapter's driver says so
+    with pytest.raises(BusDownError, match="bus flaky: python-can cannot send: transmit queue full") as caught:
+        port.send(SYNC * 3)
+    assert (caught.value.sent, port.receive(1.0)) == (len(SYNC), SYNC)
+    with pytest.raises(BusDownError):
+        port.send(SYNC)
+    assert port.down is not None
+    port.send(SYNC)
+    assert (port.down, port.receive(1.0)) == (None, SYNC)
+    port.close()
+    assert port.receive(0.0) == b""
+    assert "cannot receive" in str(port.down)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from hal.bus import socketcan
 from hal.bus.counters import DropCounters, describe
 from hal.bus.errors import BusDownError, BusError, BusLostError, BusOverflowError, BusUnavailableError
 from hal.bus.gather import PortGroup
@@ -55,12 +54,13 @@ class FailingSocket:
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[SocketCanPort, FailingSocket, socket.socket]]:
-    """(port on the loopback interface's name, its socket, the other end)."""
+def pair(request: pytest.FixtureRequest) -> Iterator[tuple[SocketCanPort, FailingSocket, socket.socket]]:
+    """(port on the loopback interface's name, its socket, the other end); its patience [s] may be given."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     far.setblocking(False)
     failing = FailingSocket(near)
-    port = SocketCanPort("right", "lo", PairBus(failing))  # type: ignore[arg-type]  # a socket but for its type
+    room_s: float = getattr(request, "param", 30.0)
+    port = SocketCanPort("right", "lo", PairBus(failing), room_s=room_s)  # type: ignore[arg-type]  # as good a socket
     yield port, failing, far
     port.close()
     far.close()
@@ -116,21 +116,16 @@ def test_a_group_shows_an_outage_once(pair: tuple[SocketCanPort, FailingSocket, 
     assert group.receive(0.0) == []
 
 
-def test_room_in_the_queue_is_waited_for(
-    pair: tuple[SocketCanPort, FailingSocket, socket.socket], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_room_in_the_queue_is_waited_for(pair: tuple[SocketCanPort, FailingSocket, socket.socket]) -> None:
     port, failing, far = pair
-    monkeypatch.setattr(socketcan, "ROOM_S", 30.0)
     failing.errors = [errno.ENOBUFS, errno.EAGAIN, errno.ENOBUFS, 0]
     port.send(SYNC)
     assert far.recv(64) == SYNC
 
 
-def test_a_queue_that_stays_full_is_an_overflow(
-    pair: tuple[SocketCanPort, FailingSocket, socket.socket], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("pair", [0.005], indirect=True)
+def test_a_queue_that_stays_full_is_an_overflow(pair: tuple[SocketCanPort, FailingSocket, socket.socket]) -> None:
     port, failing, far = pair
-    monkeypatch.setattr(socketcan, "ROOM_S", 0.005)
     failing.errors = [0, *[errno.ENOBUFS] * 10_000]
     with pytest.raises(BusOverflowError, match="lo takes no more frames; does a node acknowledge") as caught:
         port.send(SYNC * 2)

@@ -1,4 +1,4 @@
-"""Exact frame lengths: against a bit-by-bit encoder written from ISO 11898-1, a frame worked out by hand, the bounds."""
+"""Exact frame lengths: against a bit-by-bit encoder written from ISO 11898-1, a frame worked out by hand, bounds."""
 
 from __future__ import annotations
 

@@ -75,6 +75,8 @@ def test_default(wire, variable):
     data = upload(wire, variable)
     if variable.index == 0x1003 and variable.subindex:
         assert data == "abort 24 00 00 08"
+    elif variable.index == 0x2006:
+        assert data == "01", "simulated time: that of no other device made after the EDS"
     elif variable.index not in LIVE:
         assert data == encoded(variable)
 
@@ -177,4 +179,4 @@ def test_the_import_warns_of_nothing(caplog):
         dictionary = canopen.import_od(eds_path(), 5)
     assert caplog.records == []
     assert dictionary.device_information.vendor_number == 0x402
-    assert len(dictionary) == 3 + 46 + 5
+    assert len(dictionary) == 3 + 46 + 6
