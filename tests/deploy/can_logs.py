@@ -52,3 +52,11 @@ def frames_of(reader: LogReader, direction: str) -> dict[str, list[str]]:
 
 def names(packet: bytes) -> list[str]:
     return [f"{can_id:03X}#{data.hex().upper()}" for can_id, data in unpack(packet)]
+
+
+def check_tests(folder: Path, name: str) -> None:
+    """Tests that ran inside have passed, all of them."""
+    (result,) = said(folder, name)
+    assert result["code"] == 0, result["out"]
+    assert " passed" in result["out"]
+    assert " skipped" not in result["out"]

@@ -20,12 +20,12 @@ HAL_CARDS, PLANT_CARDS = "can0,can2,can4", "can1,can3,can5"
 SCENARIO = "arm9-transition"
 BUSES = {"arm9-0": "vcan0", "arm9-1": "vcan1", "arm9-2": "vcan2"}
 PATIENCE_S = 900.0
-KERNEL_TESTS = (
+PORT_TESTS = (
     "tests/hal/bus/test_socketcan_kernel.py",
     "tests/hal/bus/test_bus_contract.py",
     "tests/plant_service/test_service_buses.py",
-    "tests/deploy/test_kernel_outage.py",
 )
+OUTAGE_TESTS = ("tests/deploy/test_kernel_outage.py",)
 
 
 @dataclass(frozen=True)
@@ -101,13 +101,18 @@ def visitor(folder: Path) -> list[Said]:
     return [said]
 
 
-def kernel_tests(folder: Path) -> list[Said]:
-    """Tests that need a kernel with CAN."""
-    return [call("python", "-m", "pytest", "-q", "-rs", *KERNEL_TESTS)]
+def port_tests(folder: Path) -> list[Said]:
+    """Tests of ports and of the plant on interfaces, that need a kernel with CAN."""
+    return [call("python", "-m", "pytest", "-rs", *PORT_TESTS)]
+
+
+def outage_tests(folder: Path) -> list[Said]:
+    """Whole runs whose interfaces go down or report trouble."""
+    return [call("python", "-m", "pytest", "-rs", *OUTAGE_TESTS)]
 
 
 RUNS: dict[str, Callable[[Path], list[Said]]] = {
-    run.__name__: run for run in (direct, virtual, vcan, kvaser, alone, visitor, kernel_tests)
+    run.__name__: run for run in (direct, virtual, vcan, kvaser, alone, visitor, port_tests, outage_tests)
 }
 
 

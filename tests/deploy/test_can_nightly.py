@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from schemas.messages import JointCommand, RobotState
-from tests.deploy.can_logs import log, messages, run_inside, said
+from tests.deploy.can_logs import check_tests, log, messages, run_inside, said
 
 pytestmark = [pytest.mark.can_machine, pytest.mark.nightly, pytest.mark.timeout(2400)]
 
 
 @pytest.fixture(scope="module")
 def folder(can_machine: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_inside(tmp_path_factory.mktemp("can"), "direct", "virtual", "visitor", "kernel_tests")
+    return run_inside(tmp_path_factory.mktemp("can"), "direct", "virtual", "visitor", "port_tests", "outage_tests")
 
 
 @pytest.mark.parametrize("kind", [RobotState, JointCommand])
@@ -36,7 +36,8 @@ def test_drives_of_another_maker_are_booted_and_moved(folder: Path) -> None:
 
 
 def test_trouble_of_the_kernels_can_is_told_of_and_recovered_from(folder: Path) -> None:
-    (result,) = said(folder, "kernel_tests")
-    assert result["code"] == 0, result["out"]
-    assert " passed" in result["out"]
-    assert "skipped" not in result["out"]
+    check_tests(folder, "outage_tests")
+
+
+def test_ports_and_plant_on_the_kernels_can(folder: Path) -> None:
+    check_tests(folder, "port_tests")
