@@ -31,6 +31,8 @@ class FrameKinematics:
     """(6,) [v; ω] = J q̇."""
     drift: Array
     """J̇ q̇ (6,): [v̇; ω̇] at q̈ = 0, v̇ the derivative of v (classical acceleration)."""
+    jacobian_rate: Array
+    """J̇ (6, n)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +115,7 @@ class RobotModel:
         frames: dict[str, FrameKinematics] = {}
         if self._frames:
             pin.forwardKinematics(model, data, q, v, self._zero)
+            pin.computeJointJacobiansTimeVariation(model, data, q, v)
             for name, index in self._frames.items():
                 frames[name] = self._kinematics(index, velocity)
         return Configuration(
@@ -142,12 +145,16 @@ class RobotModel:
         if self._order is not None:
             jacobian = jacobian[:, self._order]
         drift = pin.getFrameClassicalAcceleration(model, data, index, axes).vector
+        rate = pin.getFrameJacobianTimeVariation(model, data, index, axes)
+        if self._order is not None:
+            rate = rate[:, self._order]
         return FrameKinematics(
             _frozen(placement.translation.copy()),
             _frozen(placement.rotation.copy()),
             _frozen(jacobian),
             _frozen(jacobian.dot(velocity)),
             _frozen(drift.copy()),
+            _frozen(rate),
         )
 
     def _frame_id(self, name: str) -> int:

@@ -14,8 +14,18 @@ from schemas.scenario import Friction
 
 Array = NDArray[np.float64]
 
+FRICTION_STREAM = 4
+"""Of the seed, beside those of masses, motors and sensors."""
+
 BRAKE_FACTOR = 10.0
 """Torque of the holding brake over the joint's torque limit."""
+
+
+def friction_factors(count: int, error: float, seed: int) -> Array:
+    """Draw true over given friction of n joints, shape (n,): uniform within 1 ± error, from the seed."""
+    draws = np.random.default_rng([seed, FRICTION_STREAM]).uniform(-1.0, 1.0, count)
+    factors: Array = 1.0 + error * draws
+    return factors
 
 
 class DryFriction:
@@ -27,12 +37,13 @@ class DryFriction:
         friction: Parameters at the motor.
         gear_ratio: N, shape (n,).
         torque_limit: [N·m] at the joint, shape (n,), from which the brake's torque follows.
+        factor: true over given friction of each joint, shape (n,); the brake is not part of it.
 
     """
 
-    def __init__(self, friction: Friction, gear_ratio: Array, torque_limit: Array) -> None:
-        self._coulomb = friction.coulomb * gear_ratio
-        self._excess = (friction.breakaway - friction.coulomb) * gear_ratio
+    def __init__(self, friction: Friction, gear_ratio: Array, torque_limit: Array, factor: Array | float = 1.0) -> None:
+        self._coulomb = friction.coulomb * gear_ratio * factor
+        self._excess = (friction.breakaway - friction.coulomb) * gear_ratio * factor
         self._exponent = -np.square(gear_ratio / friction.stribeck_velocity)
         self._brake_torque = BRAKE_FACTOR * torque_limit
         self._offset = self._coulomb + self._brake_torque

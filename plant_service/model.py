@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant_service.errors import PlantError
+from plant_service.friction import friction_factors
+from plant_service.obstacles import add_obstacles, refuse_penetration
 from schemas.load import Robot
 from schemas.scenario import PlantConfig
 
@@ -39,6 +41,8 @@ class PlantModel:
     """Joint angles at the start [rad], in the order of the description."""
     mass_factors: dict[str, float]
     """True over described mass of each link."""
+    friction_factors: NDArray[np.float64]
+    """True over given friction of each joint, in the order of the description."""
 
 
 def build(robot: Robot, config: PlantConfig, seed: int) -> PlantModel:
@@ -46,10 +50,11 @@ def build(robot: Robot, config: PlantConfig, seed: int) -> PlantModel:
 
     Armature J N² and viscous friction N² v come from the description and the scenario; joints of the URDF that the
     description does not name are locked at zero; meshes are left out, primitives kept; links joined by one joint do
-    not collide. Every link's mass and inertia is multiplied by 1 ± `config.mass_error`, signs drawn from `seed`.
+    not collide. Every link's mass and inertia is multiplied by 1 ± `config.mass_error`, signs drawn from `seed`, every
+    joint's friction by a factor within 1 ± `config.friction_error`. The world's obstacles touch all moving links.
 
     Raises:
-        PlantError: MuJoCo cannot build the URDF, or a frame or joint is missing in it.
+        PlantError: MuJoCo cannot build the URDF, a frame or joint is missing in it, or the robot starts in an obstacle.
 
     """
     description = robot.description
@@ -60,10 +65,12 @@ def build(robot: Robot, config: PlantConfig, seed: int) -> PlantModel:
     spec.compiler.fusestatic = False
     spec.compiler.balanceinertia = False
     _set_options(spec, config, description.gravity_in_world)
-    _set_joints(spec, robot, config)
+    friction = friction_factors(len(description.joints), config.friction_error, seed)
+    _set_joints(spec, robot, config, friction)
     factors = _perturb_masses(spec, config.mass_error, seed)
     _add_sensors(spec, robot)
     _exclude_neighbours(spec, description.name)
+    add_obstacles(spec, config.world, description.name)
     model = _compile(spec, description.name)
 
     joints = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in description.joint_names]
@@ -73,13 +80,17 @@ def build(robot: Robot, config: PlantConfig, seed: int) -> PlantModel:
             raise PlantError(
                 f"plant.truth_frames: {description.name} has no link {frame!r}; it has {', '.join(bodies)}"
             )
+    qpos_address = np.array([model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)
+    position = initial_position(robot, config)
+    refuse_penetration(model, qpos_address, position, description.name)
     return PlantModel(
         model=model,
-        qpos_address=np.array([model.jnt_qposadr[joint] for joint in joints], dtype=np.intp),
+        qpos_address=qpos_address,
         dof_address=np.array([model.jnt_dofadr[joint] for joint in joints], dtype=np.intp),
         frame_bodies=bodies,
-        initial_position=initial_position(robot, config),
+        initial_position=position,
         mass_factors=factors,
+        friction_factors=friction,
     )
 
 
@@ -128,18 +139,20 @@ def _set_options(spec: mujoco.MjSpec, config: PlantConfig, gravity: Iterable[flo
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
 
 
-def _set_joints(spec: mujoco.MjSpec, robot: Robot, config: PlantConfig) -> None:
+def _set_joints(spec: mujoco.MjSpec, robot: Robot, config: PlantConfig, friction: NDArray[np.float64]) -> None:
     described = {joint.name: joint for joint in robot.description.joints}
+    factors = dict(zip(robot.description.joint_names, friction.tolist(), strict=True))
     for element in list(spec.joints):
         joint = described.get(element.name)
         if joint is None:
             spec.delete(element)
             continue
         element.armature = joint.rotor_inertia * joint.gear_ratio**2
-        element.damping = [config.friction.viscous * joint.gear_ratio**2, 0.0, 0.0]
+        factor = factors[joint.name]
+        element.damping = [config.friction.viscous * joint.gear_ratio**2 * factor, 0.0, 0.0]
         # The time constant 2h stops a joint within one step, the stiffest that does not overshoot. A row of friction
         # exists from the start for a joint whose bound is not zero; the bound itself is set at every step.
-        element.frictionloss = max(config.friction.breakaway * joint.gear_ratio, 1e-9)
+        element.frictionloss = max(config.friction.breakaway * joint.gear_ratio * factor, 1e-9)
         element.solref_friction = [2.0 * config.substep_s, 1.0]
         element.solimp_friction = [FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0]
 

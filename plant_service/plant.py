@@ -66,6 +66,8 @@ class Plant:
         self._down = [False] * len(nodes)
         self._now_ns = self.simulation.time_ns
         self._free = free
+        if free:
+            self.simulation.count_events_from(None)  # the masters' first SYNC is time 0
         self._origin_ns = 0
         self._looked_ns = [self._now_ns] * len(nodes)
         """Until when the frames of each bus have been looked at (`free`)."""
@@ -181,6 +183,7 @@ class Plant:
         if self.sequence >= 0:
             self.sequence += periods
             self._origin_ns -= periods * self._robot.period_ns
+            self.simulation.count_events_from(self._origin_ns)
 
     def free_run(self) -> tuple[bytes, ...]:
         """Integrate one period without SYNC; what the nodes of each bus say on their own, to be sent at once."""
@@ -226,6 +229,7 @@ class Plant:
     def _deliver_free(self, bus_index: int, packet: bytes, frames: list[bytes], syncs: int, after_ns: int) -> bytes:
         if syncs and self.sequence < 0:
             self.sequence, self._origin_ns = 0, self._now_ns
+            self.simulation.count_events_from(self._origin_ns)
         wire = self._wires[bus_index]
         if wire is None:
             return self._boot[bus_index].exchange(packet, self._now_ns)

@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant_service.axis import Axis
-from plant_service.errors import DivergedError, PlantError
+from plant_service.errors import DivergedError
 from plant_service.firmware import Firmware
 from plant_service.friction import DryFriction
 from plant_service.joint_axis import JointAxis
 from plant_service.joint_entries import JointEntries
 from plant_service.model import PlantModel, build
+from plant_service.obstacles import Contacts
 from plant_service.sensors import Sensors
+from plant_service.world import WorldLoads
 from schemas.load import Robot
 from schemas.messages import DriveState, PlantTruth, PoseSample
 from schemas.scenario import PlantConfig
@@ -46,7 +48,8 @@ class Simulation:
         self._substeps = round(description.period_s / config.substep_s)
         joints = description.joints
         gear = np.array([joint.gear_ratio for joint in joints])
-        self._friction = DryFriction(config.friction, gear, np.array([joint.torque_limit for joint in joints]))
+        torque_limit = np.array([joint.torque_limit for joint in joints])
+        self._friction = DryFriction(config.friction, gear, torque_limit, self._plant.friction_factors)
         self._firmware = Firmware(description, config, seed)
         self.axes: tuple[Axis, ...] = tuple(JointAxis(self._firmware, index) for index in range(len(joints)))
         """One axis a joint, for the simulated drives."""
@@ -56,7 +59,6 @@ class Simulation:
         self._frames = {
             name: (self._data.xpos[body_of[name]], self._data.xquat[body_of[name]]) for name in self._truth_frames()
         }
-        self._loads: dict[str, tuple[Array, Array]] = {}
 
         self._position = np.array(self._plant.initial_position)
         self._velocity = np.zeros(len(joints))
@@ -64,7 +66,7 @@ class Simulation:
         self._motor_torque = np.zeros((0, len(joints)))
         self._friction_torque = np.zeros(len(joints))
         self._mode = self._firmware.mode.copy()
-        self._contact_force = 0.0
+        self._contacts = Contacts(self._model)
         self._periods = 0
 
         model, data, dofs = self._model, self._data, self._plant.dof_address
@@ -81,6 +83,7 @@ class Simulation:
         self._sensors_off = self._sensors_on | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._apply_brakes()
         mujoco.mj_forward(self._model, self._data)
+        self._loads = WorldLoads(self._model, self._data, config.world, body_of, config.substep_s)
         self._sample_constraints(self._velocity)
         self._firmware.sample(self._position, self._velocity)
         self.sensors.sample(self._sensordata)
@@ -101,24 +104,30 @@ class Simulation:
         mujoco.mj_energyVel(self._model, self._data)
         return float(self._data.energy[1])
 
+    def count_events_from(self, time_ns: int | None) -> None:
+        """Tell the simulated time [ns] of sequence 0, from which the times of the world's events count.
+
+        It is 0 until told otherwise. None: not yet known, so that no event acts. A time that moves back lets the events
+        come sooner, as after periods that were left out; none begins twice.
+        """
+        self._loads.origin_ns = time_ns
+
     def apply_wrench(
         self, link: str, point_in_link: Sequence[float] | None = None, force_in_world: Sequence[float] | None = None
     ) -> None:
         """Push a point of a link [m, in the link's frame] with a force [N, in the world] until told otherwise.
 
-        The force follows the point from period to period. Without force the link is released.
+        The force follows the point from substep to substep and adds to those of the scenario's events. Without force
+        the link is released.
 
         Raises:
             PlantError: the robot has no such link.
 
         """
-        if link not in self._plant.frame_bodies:
-            raise PlantError(f"apply_wrench: {self._description.name} has no link {link!r}")
         if force_in_world is None:
-            self._loads.pop(link, None)
-            self._data.xfrc_applied[self._plant.frame_bodies[link]] = 0.0
+            self._loads.release(link)
         else:
-            self._loads[link] = (np.array(point_in_link or (0.0, 0.0, 0.0)), np.array(force_in_world))
+            self._loads.set_load(link, point_in_link or (0.0, 0.0, 0.0), force_in_world)
 
     def advance(self) -> None:
         """Integrate one period: for each substep the firmware's law, then the bodies; then sample for the next SYNC.
@@ -131,7 +140,7 @@ class Simulation:
         step1, step2 = mujoco.mj_step1, mujoco.mj_step2
         scale = self._torque_scale
         self._mode[:] = firmware.mode
-        self._apply_loads()
+        loads = self._loads if self._loads.begin_period(self.time_ns, self._substeps) else None
         if firmware.brakes_changed:
             self._apply_brakes()
             step1(model, data)
@@ -150,10 +159,12 @@ class Simulation:
             if index == last:
                 self._options.disableflags = self._sensors_on
                 previous = velocity.copy()
+            if loads is not None:
+                loads.apply(index)
             step2(model, data)
             position, velocity = self._joint_position.read(), self._joint_velocity.read()
             if index == last:
-                self._sample_constraints(previous)
+                self._sample_constraints(velocity)  # implicitfast: viscous friction acts at the end of the step
             self._joint_friction.write(self._friction.bound(velocity))
             step1(model, data)
         self._acceleration = (velocity - previous) / self._config.substep_s
@@ -167,8 +178,9 @@ class Simulation:
     def truth(self, sequence: int, drive_states: Sequence[DriveState]) -> PlantTruth:
         """Tell what is true at this SYNC.
 
-        Accelerations, friction and contact forces are those of the substep that ended here. Friction is signed as it
-        acts: M q̈ + h = motor_torque + friction_torque (+ limits and contacts).
+        Accelerations, friction, contacts and the world's forces are those of the substep that ended here. Friction is
+        signed as it acts: M q̈ + h = motor_torque + friction_torque + Σ Jᵀ F (+ limits), F the forces of contacts and
+        world at their points.
         """
         torques = self._motor_torque
         now = torques[-1] if len(torques) else np.zeros(len(self._position))
@@ -185,7 +197,9 @@ class Simulation:
             friction_torque=tuple(self._friction_torque.tolist()),
             frames={name: _pose(*views) for name, views in self._frames.items()},
             sensor_wrenches=dict(self.sensors.true_wrenches),
-            contact_force=self._contact_force,
+            contact_force=self._contacts.force,
+            contacts=self._contacts.samples,
+            world_forces=dict(self._loads.forces),
             kinetic_energy=self.kinetic_energy,
         )
 
@@ -202,14 +216,6 @@ class Simulation:
         self._friction.set_brakes(self._firmware.braked)
         self._joint_friction.write(self._friction.bound(self._velocity))
         self._firmware.brakes_changed = False
-
-    def _apply_loads(self) -> None:
-        data = self._data
-        for link, (point, force) in self._loads.items():
-            body = self._plant.frame_bodies[link]
-            arm = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point - data.xipos[body]
-            data.xfrc_applied[body, :3] = force
-            data.xfrc_applied[body, 3:] = np.cross(arm, force)
 
     def _raise_diverged(self) -> NoReturn:
         kind = mujoco.mjtWarning(int(np.flatnonzero(self._warnings)[0])).name.removeprefix("mjWARN_")
@@ -230,14 +236,7 @@ class Simulation:
             every[data.efc_id[rows]] = data.efc_force[rows]
             dry = every[self._plant.dof_address]
         self._friction_torque = dry - self._joint_damping.read() * velocity
-        self._contact_force = 0.0
-        contacts = data.ncon
-        if contacts == 0:
-            return
-        wrench = np.empty(6)
-        for contact in range(contacts):
-            mujoco.mj_contactForce(model, data, contact, wrench)
-            self._contact_force += float(np.linalg.norm(wrench[:3]))
+        self._contacts.sample(data)
 
 
 def _pose(position: Array, quaternion: Array) -> PoseSample:

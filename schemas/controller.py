@@ -7,8 +7,21 @@ from typing import Annotated, Literal
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from schemas.base import ControlMode, Model
+from schemas.control_law import (
+    AntiWindup,
+    CollisionAvoidance,
+    DisturbanceObserver,
+    FrictionCompensation,
+    HandForce,
+    Leak,
+    NullSpace,
+)
 
 NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+OPTIONAL_PARTS = ("null_space", "friction_compensation", "observer", "hand_force", "collision")
+"""Of `ControllerConfig`; an empty mapping takes a part with its defaults."""
 
 
 class TaskGains(Model):
@@ -58,11 +71,24 @@ class QpConfig(Model):
 class ControllerConfig(Model):
     """Gains of the law and the tasks, and the phases. λ times the period must not exceed 0.3 (see `lambda_`)."""
 
+    gains: str | None = None
+    """Where the rest came from: a packaged set (`paper`, `tuned`) or a YAML file of values for these fields, which the
+    scenario's own override. Parts that are absent unless named (`OPTIONAL_PARTS`) take a set's values only where the
+    scenario names them."""
     lambda_: Annotated[float, Field(alias="lambda", gt=0.0)] = 2.0
     """λ of K = λ diag(M) [1/s]. The integral loop's discrete pole sits near 1 − λT and a cycle of delay costs phase:
     λT ≤ 0.3 is required, well below is advised."""
     integral: Literal["passivity", "none"] = "passivity"
     """`passivity`: L s = (C + K) s of (3), (4); `none`: u = uʳ alone, the baseline without integral term."""
+    leak: Leak | None = None
+    """None: a pure integrator, s̃ = s."""
+    anti_windup: AntiWindup = AntiWindup()
+    null_space: NullSpace | None = None
+    """None: the law (3) in all joints."""
+    friction_compensation: FrictionCompensation | None = None
+    observer: DisturbanceObserver | None = None
+    hand_force: HandForce | None = None
+    collision: CollisionAvoidance | None = None
     initialize_integral: bool = True
     """Position→torque transition: start the integral term at the torque difference (section IV-A); False is naive."""
     velocity_cutoff_hz: PositiveFloat = 60.0

@@ -15,6 +15,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from schemas.bus_load import cycle_plan
+from schemas.controller import OPTIONAL_PARTS
 from schemas.errors import ConfigurationError
 from schemas.robot import RobotDescription
 from schemas.scenario import Scenario
@@ -63,7 +64,8 @@ def load_run(scenario: str, overrides: dict[str, Any] | None = None) -> Run:
     for key, value in (overrides or {}).items():
         of_robot = key.startswith("robot.")
         split[of_robot][key.removeprefix("robot.")] = value
-    config = _parse(Scenario, _override(_read_yaml(path), split[False], path), path)
+    data = _with_gains(_override(_read_yaml(path), split[False], path), path)
+    config = _parse(Scenario, data, path)
     beside = path.parent / config.robot
     name = str(beside) if beside.is_file() else config.robot
     robot = load_robot(name, split[True], allow_overload=config.allow_overload)
@@ -172,11 +174,38 @@ def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> 
             f" {MAXIMUM_LAMBDA_PERIOD} (λ ≤ {MAXIMUM_LAMBDA_PERIOD * robot.rate_hz:g}), or the integral loop"
             " is unstable"
         )
+    for part in ("null_space", "hand_force"):
+        if getattr(scenario.controller, part) is not None and robot.hand_frame is None:
+            raise ConfigurationError(f"{path}: controller.{part}: robot {robot.name} has no hand_frame")
     for index, phase in enumerate(scenario.controller.phases):
         if phase.hand_path is not None and robot.hand_frame is None:
             raise ConfigurationError(
                 f"{path}: controller.phases.{index}.hand_path: robot {robot.name} has no hand_frame"
             )
+
+
+def _with_gains(data: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Lay a scenario's controller over the set of gains that it names."""
+    controller = data.get("controller")
+    name = controller.get("gains") if isinstance(controller, dict) else None
+    if not isinstance(controller, dict) or not isinstance(name, str):
+        return data
+    beside = path.parent / name
+    source = beside if beside.is_file() else _find(name, "gains", "gains")
+    gains = _read_yaml(source)
+    for part in OPTIONAL_PARTS:
+        if controller.get(part) is None:
+            gains.pop(part, None)
+    return data | {"controller": _overlay(gains, controller)}
+
+
+def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Merge mappings key by key; elsewhere what is above wins."""
+    merged = below | above
+    for key in below.keys() & above.keys():
+        if isinstance(below[key], dict) and isinstance(above[key], dict):
+            merged[key] = _overlay(below[key], above[key])
+    return merged
 
 
 def _find(name: str, folder: str, what: str) -> Path:

@@ -135,7 +135,29 @@ class ControllerTrace(Model):
     torque_reference: Vector
     """uʳ of (2) [N·m]."""
     torque_integral: Vector
-    """L s of (3) [N·m]."""
+    """All that the law adds to uʳ for the velocity error [N·m]: L s of (3), or the terms after uʳ in (21), limited."""
+    torque_windup: Vector = ()
+    """u_K before the anti-windup's limit [N·m]; this and the next seven are empty outside torque mode."""
+    torque_limited: Vector = ()
+    """ũ_K of (11) [N·m], part of `torque_integral`."""
+    windup_bound: Vector = ()
+    """Bound of ũ_K in effect [N·m]: τ_m, or more after a change of mode."""
+    torque_friction: Vector = ()
+    """Friction compensation [N·m]; empty without."""
+    null_space_share: float = 0.0
+    """σ: 0 is the law (3), 1 the null-space compliant law (21)."""
+    torque_external_estimated: Vector = ()
+    """Of the momentum observer, as Jᵀ F of the environment on the robot [N·m]; empty without."""
+    contact: bool = False
+    """The observer's estimate is over its thresholds."""
+    wrench_estimated: Vector = ()
+    """Of the environment on the hand: force [N], moment [N·m] at the hand frame's origin, world axes; empty without."""
+    wrench_reference: Vector = ()
+    """Fʳ, as the above."""
+    admittance: bool = False
+    """The hand follows the wrench."""
+    relaxed: tuple[str, ...] = ()
+    """Limits that could not be kept this tick, by name."""
     torque_commanded: Vector
     """u of (3), or the computed torque while in position mode [N·m]."""
     position_reference: Vector
@@ -146,6 +168,17 @@ class ControllerTrace(Model):
     qp_primal_residual: float
     qp_dual_residual: float
     qp_status: str
+
+
+class ContactSample(Model):
+    """All contacts of a link with an obstacle or with another link, the one nearer the base, summed."""
+
+    link: str
+    other: str
+    force_in_world: Vector3
+    """[N] on `link`."""
+    position_in_world: Vector3
+    """[m] mean of the points, weighted by the norms of their forces."""
 
 
 class PlantTruth(Model):
@@ -174,6 +207,10 @@ class PlantTruth(Model):
     """Force and moment each F/T sensor would read without noise, offset and quantisation, in the sensor frame."""
     contact_force: float = 0.0
     """Sum of the norms of all contact forces [N]."""
+    contacts: tuple[ContactSample, ...] = ()
+    """One a pair that touches, in the order of MuJoCo's contacts."""
+    world_forces: dict[str, Vector3] = Field(default_factory=dict)
+    """Force [N] in the world of each of the scenario's events that acts, by its name."""
     kinetic_energy: float = 0.0
     """[J], rotors included."""
 

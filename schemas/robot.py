@@ -145,6 +145,17 @@ class Imu(Model):
     """Added to the maker's identifiers 0x32 (gyro), 0x34 (acceleration), 0x21 (quaternion), which outrank SYNC."""
 
 
+class Capsule(Model):
+    """A link's shape for collision avoidance: all points within `radius` of a segment fixed in the link's frame."""
+
+    name: str
+    link: str
+    """URDF link."""
+    start_in_link: Vector3
+    end_in_link: Vector3
+    radius: PositiveFloat
+
+
 class Safety(Model):
     """What the HAL does by itself, whatever the controller says."""
 
@@ -188,6 +199,10 @@ class RobotDescription(Model):
     joints: Annotated[tuple[Joint, ...], Field(min_length=1)]
     force_torque_sensors: tuple[ForceTorqueSensor, ...] = ()
     imus: tuple[Imu, ...] = ()
+    capsules: tuple[Capsule, ...] = ()
+    """Shapes of links, for the controller's collision avoidance."""
+    collision_pairs: tuple[tuple[str, str], ...] = ()
+    """Names of capsules that are kept apart; every capsule is also kept from the obstacles that a scenario names."""
     gravity_in_world: Vector3 = (0.0, 0.0, -9.81)
     safety: Safety = Safety()
 
@@ -218,6 +233,12 @@ class RobotDescription(Model):
         _refuse_twice("joint", [joint.name for joint in self.joints])
         sensors: tuple[ForceTorqueSensor | Imu, ...] = (*self.force_torque_sensors, *self.imus)
         _refuse_twice("sensor", [sensor.name for sensor in sensors])
+        capsules = [capsule.name for capsule in self.capsules]
+        _refuse_twice("capsule", capsules)
+        for pair in self.collision_pairs:
+            for capsule in pair:
+                if capsule not in capsules:
+                    raise ValueError(f"collision_pairs: unknown capsule {capsule!r}; there are {', '.join(capsules)}")
         names = {bus.name for bus in self.buses}
         users = [(joint.name, joint.drive.bus) for joint in self.joints]
         users += [(sensor.name, sensor.bus) for sensor in sensors]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, model_validator
 
 from schemas.base import Clock, Model
 from schemas.controller import ControllerConfig
+from schemas.world import World
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 
@@ -53,6 +54,9 @@ class PlantConfig(Model):
     dead_zone_scale: NonNegative = 1.0
     """True dead zone over the described one."""
     friction: Friction = Friction()
+    friction_error: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    """Every joint's friction (Coulomb, breakaway, viscous) is multiplied by a factor within 1 ± this, uniform, drawn
+    from the seed."""
     noise: SensorNoise = SensorNoise()
     free_run_after_s: PositiveFloat = 10.0
     """Lockstep: wall-clock silence of the bus after which the plant runs on by itself so that drives notice a HAL that
@@ -61,6 +65,18 @@ class PlantConfig(Model):
     """Joint angles [rad] at the start; joints not named start at 0 or the nearest limit."""
     truth_frames: tuple[str, ...] = ()
     """Extra URDF frames whose true poses are reported; the hand frame always is."""
+    world: World = World()
+    """Obstacles, pushes and hands that the controller does not know of."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for index, event in enumerate(self.world.events):
+            if event.duration_s < self.substep_s:
+                raise ValueError(
+                    f"world.events.{index}.duration_s: {event.name} would be missed: {event.duration_s:g} s is less"
+                    f" than substep_s, {self.substep_s:g} s"
+                )
+        return self
 
 
 class Scenario(Model):

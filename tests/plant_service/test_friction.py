@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from plant_service.friction import BRAKE_FACTOR, DryFriction
+from plant_service.friction import BRAKE_FACTOR, DryFriction, friction_factors
 from plant_service.model import FRICTION_IMPEDANCE, build
 from plant_service.simulation import Simulation
 from schemas.load import Robot, load_robot
@@ -92,6 +92,42 @@ def test_brake_adds_to_friction_where_engaged() -> None:
     law = DryFriction(TABLE, np.full(2, N), np.full(2, 300.0))
     law.set_brakes(np.array([True, False]))
     assert law.bound(np.zeros(2)) == pytest.approx([12.5 + BRAKE_FACTOR * 300.0, 12.5])
+
+
+def test_a_factor_scales_the_curve_and_not_the_brake() -> None:
+    factors = np.array([0.7, 1.0, 1.3])
+    true, given = (DryFriction(TABLE, np.full(3, N), np.full(3, 300.0), factor) for factor in (factors, 1.0))
+    brake = BRAKE_FACTOR * 300.0
+    for v in (0.0, 4e-4, 0.1):
+        velocity = np.full(3, v)
+        assert true.bound(velocity) - brake == pytest.approx(factors * (given.bound(velocity) - brake), rel=1e-12)
+
+
+def test_factors_are_uniform_within_the_error_and_drawn_from_the_seed() -> None:
+    factors = friction_factors(4000, 0.3, 5)
+    assert factors.min() >= 0.7
+    assert factors.max() <= 1.3
+    shares = np.histogram(factors, bins=4, range=(0.7, 1.3))[0] / 4000.0
+    assert shares == pytest.approx(0.25, abs=0.03)
+    assert (factors == friction_factors(4000, 0.3, 5)).all()
+    assert (factors != friction_factors(4000, 0.3, 6)).all()
+    assert (friction_factors(9, 0.0, 5) == 1.0).all()
+
+
+def test_friction_of_a_joint_is_that_of_its_factor() -> None:
+    """Steady velocities of wheels of several seeds: τ = f (N c + N² v q̇); damping and breakaway with the same f."""
+    factors = set()
+    for seed in range(3):
+        simulation = Simulation(wheel(), PlantConfig(torque_scale=1.0, mass_error=0.0, friction_error=0.4), seed)
+        plant = simulation.plant
+        (factor,) = plant.friction_factors
+        assert plant.model.dof_damping[0] == pytest.approx(factor * N**2 * TABLE.viscous, rel=1e-12)
+        simulation.axes[0].follow_torque(400, 3000)
+        assert velocity(run(simulation, 2.0)) == pytest.approx(
+            (40.0 / factor - N * TABLE.coulomb) / (N**2 * TABLE.viscous), rel=1e-4
+        )
+        factors.add(factor)
+    assert len(factors) == 3
 
 
 @pytest.mark.parametrize("motor_velocity", [0.05, 0.1, 0.2, 0.4, 1.0, 10.0])

@@ -65,6 +65,16 @@ def test_mass_error_scales_mass_and_inertia_by_the_seed() -> None:
     assert first.model.body_inertia[1:] == pytest.approx(exact.model.body_inertia[1:] * factors[:, np.newaxis])
 
 
+def test_friction_error_scales_each_joint_and_leaves_the_masses() -> None:
+    exact, first = (build(ROBOT, PlantConfig(friction_error=error), 1) for error in (0.0, 0.25))
+    assert first.mass_factors == exact.mass_factors
+    assert (exact.friction_factors == 1.0).all()
+    assert np.ptp(first.friction_factors) > 0.1
+    for name in ("dof_damping", "dof_frictionloss"):
+        scaled = getattr(exact.model, name)[first.dof_address] * first.friction_factors
+        assert getattr(first.model, name)[first.dof_address] == pytest.approx(scaled, rel=1e-12)
+
+
 def test_armature_and_viscous_friction_are_reflected_through_the_gear() -> None:
     model = build(ROBOT, EXACT, 0).model
     squares = np.array([joint.gear_ratio for joint in ROBOT.description.joints]) ** 2

@@ -14,6 +14,7 @@ from schemas.messages import (
     AppliedCommand,
     BusFrames,
     BusStatistics,
+    ContactSample,
     ControllerTrace,
     CycleStatistics,
     DriveState,
@@ -97,6 +98,11 @@ MESSAGES: dict[type[Model], st.SearchStrategy[Model]] = {
         friction_torque=vectors,
         frames=st.dictionaries(names, poses, max_size=2),
         sensor_wrenches=st.dictionaries(names, st.tuples(triples, triples), max_size=1),
+        contacts=st.lists(
+            st.builds(ContactSample, link=names, other=names, force_in_world=triples, position_in_world=triples),
+            max_size=2,
+        ).map(tuple),
+        world_forces=st.dictionaries(names, triples, max_size=2),
     ),
     BusFrames: st.builds(BusFrames, **common, bus=names, sent=st.binary(max_size=64), received=st.binary(max_size=64)),
     Event: st.builds(

@@ -1,0 +1,190 @@
+"""Parts of the controller that [Benallegue 2021] adds to its law, each a model of its own with the paper's values."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+
+from schemas.base import Model, Vector3
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class Leak(Model):
+    """Leaky integration, (12)-(14): s̃ = μ s^θf + (1 − μ) s^θs."""
+
+    slow_rate: NonNegative = 0.1
+    """θ_s [1/s]."""
+    fast_rate: NonNegative = 100.0
+    """θ_f [1/s]."""
+    fast_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
+    """μ; below 1, since the torque at the change of mode goes into the slow state."""
+
+
+class AntiWindup(Model):
+    """Limit of the integral torque u_K, section III-B."""
+
+    method: Literal["qp", "scaling", "none"] = "qp"
+    """`qp`: (11); `scaling`: λ_w u_K with (10), the baseline; `none`: unlimited."""
+    solver: Literal["dual", "osqp"] = "dual"
+    """Of (11): its one-dimensional dual, or OSQP."""
+    torque_share: PositiveFloat = 0.1
+    """τ_m over the joint's torque limit."""
+    decay_s: PositiveFloat = 0.5
+    """Time constant with which the bound falls to τ_m after a change of mode that asked for more."""
+    back_calculation: NonNegative = 0.0
+    """κ [1/s]: rate at which the slow state follows the limited torque while the limit acts, so that it leaves the
+    limit at once when the error turns round. 0, as in the paper, lets the state wind up behind the limited torque."""
+
+
+class NullSpace(Model):
+    """Null-space compliance, section III-D, while the hand task runs."""
+
+    inverse: Literal["pseudo", "dynamic"] = "dynamic"
+    """J⁺: Moore-Penrose, or dynamically consistent M⁻¹Jᵀ(J M⁻¹ Jᵀ)⁻¹."""
+    posture_metric: Literal["inertia", "joint"] = "inertia"
+    """Metric in which the QP's posture task is met beside the hand task. With `inertia` (M) what the hand task adds,
+    M (q̈ʳ − q̈^ob), is a pure task torque; with `joint` (I) it loads the null space while the hand is off its place."""
+    fade_s: PositiveFloat = 1.0
+    """The law goes over from (3) to (21), and back, in this time."""
+    smallest_singular_value: PositiveFloat = 0.03
+    """Of J (metres and radians): below, J⁺ is not trusted and the law goes back to (3)."""
+
+
+class JointFriction(Model):
+    """Friction of a joint, at the joint: τ_f = c sign(q̇) + v q̇."""
+
+    coulomb: NonNegative
+    """c [N·m]."""
+    viscous: NonNegative
+    """v [N·m·s/rad]."""
+
+
+class FrictionCompensation(Model):
+    """Share of a friction model that is given to the motors in advance, smooth at zero velocity."""
+
+    coulomb: NonNegative = 0.04
+    """c at the motor [N·m], of every joint without an entry in `joints`; the joint feels it times its gear."""
+    viscous: NonNegative = 0.0005
+    """v at the motor [N·m·s/rad]; the joint feels it times the square of its gear."""
+    joints: dict[str, JointFriction] = Field(default_factory=dict)
+    """Identified friction, at the joint, instead of the above."""
+    share: Share = 0.6
+    """Of the model: what the true friction is surely not below, so that it is never over-compensated."""
+    smoothing_velocity: PositiveFloat = 0.2
+    """[rad/s]: the Coulomb part is c tanh(q̇/v_0). Its slope share · c/v_0 is negative damping at low speed, and slow
+    motion needs it below about half of M_jj (λ + K_v) or it sticks and slips (`controller_service.friction`)."""
+
+
+class DisturbanceObserver(Model):
+    """Momentum-based observer of external joint torques, and what a contact does."""
+
+    bandwidth: PositiveFloat = 15.0
+    """K_O [1/s]."""
+    coulomb: NonNegative = 0.04
+    """Friction known at the motor [N·m], taken from the estimate; the rest of the friction appears in it."""
+    viscous: NonNegative = 0.0005
+    """[N·m·s/rad] at the motor."""
+    threshold_share: PositiveFloat = 0.4
+    """Threshold over the torque limit, of joints without an entry in `thresholds`."""
+    thresholds: dict[str, PositiveFloat] = Field(default_factory=dict)
+    """[N·m] a joint."""
+    reaction: Literal["none", "event", "compliant", "stop"] = "event"
+    """`event`: tell; `compliant`: tell, and give up the stiffness of all tasks while the contact lasts, then go on from
+    where the robot is; `stop`: tell, and stop safely."""
+    dwell_s: NonNegative = 0.3
+    """A contact is over when all joints have been below half their threshold for this time."""
+
+
+class WrenchTask(Model):
+    """Step (a) of section III-E: the wrench that the QP is asked to exert, weight of ‖F − F^d‖²."""
+
+    weight: PositiveFloat = 10.0
+    force_in_world: Vector3 = (0.0, 0.0, 0.0)
+    """F^d [N] of the environment on the hand, world axes."""
+    torque_in_world: Vector3 = (0.0, 0.0, 0.0)
+    """[N·m] at the hand frame's origin."""
+    force_limit: PositiveFloat = 200.0
+    """Bound [N] on each component of F^r."""
+    torque_limit: PositiveFloat = 30.0
+    """[N·m]."""
+
+
+class Admittance(Model):
+    """Step (b), (27): ẍ = −K_p (F^r − F) − K_v (Ḟ^r − Ḟ), F of the environment on the hand. Table I's values."""
+
+    force_gain: NonNegative = 5e-3
+    """K_p [m/s² / N]."""
+    force_rate_gain: NonNegative = 1e-7
+    """K_v [m/s / N]."""
+    torque_gain: NonNegative = 5e-3
+    """[rad/s² / N·m]."""
+    torque_rate_gain: NonNegative = 1e-7
+    weight: NonNegative = 10000.0
+    directions: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True)
+    """World directions (three of force, three of moment) that are controlled by force: there the pose task keeps its
+    damping and loses its stiffness (hybrid control)."""
+
+
+class DualCompliance(Model):
+    """Switches the admittance on while the hand is pushed, and keeps the place where it is released (section IV-C)."""
+
+    force_on: PositiveFloat = 15.0
+    """[N]: a larger force at the hand switches it on."""
+    force_off: PositiveFloat = 6.0
+    """[N]: below for `dwell_s` switches it off."""
+    dwell_s: NonNegative = 0.15
+
+    @model_validator(mode="after")
+    def _check(self) -> DualCompliance:
+        if not self.force_off < self.force_on:
+            raise ValueError(f"force_off {self.force_off:g} N must lie below force_on {self.force_on:g} N")
+        return self
+
+
+class HandForce(Model):
+    """Force control of the hand by its force/torque sensor, section III-E."""
+
+    sensor: str
+    """Name of a sensor of the robot; what lies beyond it is taken from its reading by the URDF's inertias."""
+    cutoff_hz: PositiveFloat = 20.0
+    """First-order low-pass of the wrench."""
+    wrench_task: WrenchTask | None = None
+    """None: F^r = 0."""
+    admittance: Admittance = Admittance()
+    dual_compliance: DualCompliance | None = None
+    """None: the admittance is always on."""
+
+
+class WorldCapsule(Model):
+    """An obstacle that the controller knows."""
+
+    name: str
+    start_in_world: Vector3
+    end_in_world: Vector3
+    radius: PositiveFloat
+
+
+class CollisionAvoidance(Model):
+    """Velocity damper between the robot's capsules (`RobotDescription.capsules`) and with known obstacles.
+
+    ḋ ≥ −ξ (d − d_s)/(d_i − d_s) for pairs with d < d_i.
+    """
+
+    obstacles: tuple[WorldCapsule, ...] = ()
+    influence_m: PositiveFloat = 0.08
+    """d_i."""
+    safe_m: NonNegative = 0.02
+    """d_s."""
+    damping: PositiveFloat = 0.5
+    """ξ [m/s]: the speed of approach that is allowed at d_i."""
+    max_pairs: PositiveInt = 8
+    """Rows of the QP; the nearest pairs have them."""
+
+    @model_validator(mode="after")
+    def _check(self) -> CollisionAvoidance:
+        if not self.safe_m < self.influence_m:
+            raise ValueError(f"safe_m {self.safe_m:g} must lie below influence_m {self.influence_m:g}")
+        return self
