@@ -34,6 +34,21 @@ SERVICES = {
     "plant, SYNC served to truth sent": Service.PLANT,
     "controller, state decoded to trace sent": Service.CONTROLLER,
 }
+EVERYTHING = (
+    "arm9-dual-compliance",
+    {
+        "plant.world": {},
+        "controller.friction_compensation": {},
+        "controller.observer": {},
+        "controller.hand_force.wrench_task": {},
+        "controller.collision": {
+            "obstacles": [
+                {"name": "post", "start_in_world": [0.3, 0, -0.4], "end_in_world": [0.3, 0, 0.4], "radius": 0.05}
+            ]
+        },
+    },
+)
+"""Scenario and overrides of a run with all parts of the controller on."""
 MESSAGE = b"x" * 2048
 """About the size of arm9's state as JSON."""
 

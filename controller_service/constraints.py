@@ -1,4 +1,4 @@
-"""Limits of torque, speed and joint range as one block l ≤ A q̈ ≤ u."""
+"""Limits of torque, speed and joint range as bounds of the QP."""
 
 from __future__ import annotations
 
@@ -20,23 +20,11 @@ RESPONSE_SHARE = 0.2
 
 @dataclass(frozen=True, slots=True)
 class ConstraintRows:
-    """2n rows: first the n accelerations themselves (A = I), then the n joint torques (A = M)."""
+    """l ≤ A x ≤ u, A (m, k), bounds (m,)."""
 
     A: Array
     lower: Array
     upper: Array
-
-    @property
-    def n(self) -> int:
-        """Number of joints."""
-        return len(self.lower) // 2
-
-    def without_kinematics(self) -> ConstraintRows:
-        """Only the torque rows bound: q̈ = M⁻¹(τ − h − L s) satisfies them, so they are feasible by themselves."""
-        lower, upper = self.lower.copy(), self.upper.copy()
-        lower[: self.n] = -np.inf
-        upper[: self.n] = np.inf
-        return ConstraintRows(self.A, lower, upper)
 
 
 class JointLimits:
@@ -59,6 +47,7 @@ class JointLimits:
 
     def __init__(self, description: RobotDescription, damper_s: float) -> None:
         joints = description.joints
+        self.names = description.joint_names
         self.torque = np.array([joint.torque_limit for joint in joints])
         """(n,) [N·m]."""
         self.speed = np.array([joint.velocity_limit for joint in joints])
@@ -67,22 +56,21 @@ class JointLimits:
         self._torque_sides = np.stack((-self.torque, self.torque))
         self._braking_floor = BRAKING_FLOOR * self.torque
         self._damper = damper_s
-        self._response = max(description.period_s, RESPONSE_SHARE * damper_s)
+        self.response_s = max(description.period_s, RESPONSE_SHARE * damper_s)
+        """t_v [s]."""
         self._n = len(joints)
-        self._A = np.vstack((np.eye(self._n), np.zeros((self._n, self._n))))
 
-    def rows(self, now: Configuration, integral: Array) -> ConstraintRows:
-        """Constraints at a configuration with the integral torque L s (n,) [N·m]."""
-        n = self._n
-        A = self._A.copy()
-        A[n:] = now.mass
-        bounds = np.empty((2, 2 * n))
-        bounds[:, :n] = self.acceleration_bounds(now)
-        np.subtract(self._torque_sides, now.nonlinear + integral, out=bounds[:, n:])
-        return ConstraintRows(A, bounds[0], bounds[1])
+    def torque_bounds(self, now: Configuration, added: Array) -> Array:
+        """Bounds (2, n) [N·m] of M q̈ (− Jᵀ Fʳ) beside what the law adds, (n,) [N·m]."""
+        return np.asarray(self._torque_sides - (now.nonlinear + added))
 
-    def acceleration_bounds(self, now: Configuration) -> Array:
-        """Lower and upper bounds (2, n) [rad/s²] on q̈ from range and speed, lower ≤ upper."""
+    def acceleration_bounds(self, now: Configuration, caused: Array | None = None) -> Array:
+        """Lower and upper bounds (2, n) [rad/s²] on q̈ʳ from range and speed, lower ≤ upper.
+
+        By (31) of [Cisneros 2018] the robot accelerates by q̈ʳ + M⁻¹ u_K. That is so once the disturbance that the
+        integral stands against is gone; while it is there, by q̈ʳ. Both must keep the bounds, so `caused` = M⁻¹ u_K (n,)
+        narrows them on the side to which it points.
+        """
         left = np.maximum(self.torque - np.abs(now.nonlinear), self._braking_floor)
         twice_deceleration = 2.0 * BRAKING_SHARE * left / now.mass.diagonal()
         distance = np.empty((2, self._n))
@@ -96,7 +84,13 @@ class JointLimits:
             speed = np.minimum(np.minimum(distance / self._damper, braking), self.speed)
             np.negative(speed[0], out=speed[0])
         speed -= now.velocity
-        speed /= self._response
+        speed /= self.response_s
+        if caused is not None:
+            speed[0] -= np.minimum(caused, 0.0)
+            speed[1] -= np.maximum(caused, 0.0)
+            crossed = speed[0] > speed[1]
+            if np.count_nonzero(crossed):
+                speed[:, crossed] = 0.5 * (speed[0] + speed[1])[crossed]
         return speed
 
     def _speeds_outside(self, distance: Array, twice_deceleration: Array, outside: NDArray[np.bool_]) -> Array:

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum, auto
 
 import numpy as np
-import pinocchio as pin
 
-from controller_service.acceleration_qp import AccelerationQp
+from controller_service.acceleration_qp import AccelerationQp, ReferenceMotion
+from controller_service.collision import CollisionModel
+from controller_service.constraints import JointLimits
 from controller_service.errors import ControllerError, StateError
 from controller_service.estimation import Estimate, VelocityEstimator
-from controller_service.law import IntegralTerm, LawTerms, inverse_dynamics
+from controller_service.hand_control import HandControl
+from controller_service.law import inverse_dynamics
 from controller_service.model import Array, Configuration, RobotModel
 from controller_service.qp import QpSolution
 from controller_service.schedule import PhaseTime, References, Schedule
+from controller_service.task_set import TaskSet
+from controller_service.tick import EventLog, HandTrace, Tick, make_trace
+from controller_service.torque_mode import TorqueMode, TorqueTick
 from schemas.base import ControlMode, Vector
 from schemas.load import Run
-from schemas.messages import ControllerTrace, HalStatus, JointCommand, PoseSample, RobotState
+from schemas.messages import ControllerTrace, Event, HalStatus, JointCommand, RobotState
 
 TORQUE_SAMPLES = 8
 """Measured motor torques averaged for the transition, at rest."""
@@ -27,6 +32,10 @@ REST_SPEED = 0.02
 """[rad/s] Faster than this on any joint, the transition takes the last torque alone."""
 CLIP_SHARE = 1e-3
 """Share of the torque limit beyond which a clipped torque is reported."""
+STOP_S = 0.1
+"""Time from the failure of torque mode to the controller's end."""
+STOP_DECAY_S = 0.025
+"""Time constant with which the last torque goes over into gravity's meanwhile."""
 
 
 class Stage(Enum):
@@ -40,22 +49,8 @@ class Stage(Enum):
     """First tick of the two-step transition: the target is held, the QP has the measured configuration."""
     TORQUE = auto()
     """u = uʳ + L s at the measured configuration."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Tick:
-    """What a stage made of a state: all that command and trace need."""
-
-    mode: ControlMode
-    now: Configuration
-    solution: QpSolution
-    velocity_reference: Array
-    terms: LawTerms
-    position_reference: Array
-    position_command: Array | None
-    """None in torque mode."""
-    torque: Array
-    """u within its limits, or the computed torque in the position modes."""
+    STOPPING = auto()
+    """Torque mode cannot go on: the last torque falls to what carries the robot, then the controller gives up."""
 
 
 class Controller:
@@ -68,6 +63,9 @@ class Controller:
     measured position, and the reference starts there at rest: the holding rule has the firmware brake what still moves,
     where a reference that moved on would add k_d q̇ to the torque one period later. The HAL adds what its firmware needs
     to hold (docs/architecture.md).
+
+    When torque mode cannot go on (a QP without solution, a contact that is to stop the robot) the last torque goes over
+    into gravity's within `STOP_S` while an event tells why; then the error is raised, and the HAL holds the robot.
 
     Args:
         run: robot and scenario.
@@ -88,9 +86,17 @@ class Controller:
         self._n = self._model.n
         self._estimator = VelocityEstimator(self._period, config.velocity_cutoff_hz)
         self._schedule = Schedule(description, config.phases)
-        self._references = References(description, config)
-        self._qp = AccelerationQp(description, config.qp)
-        self._integral = IntegralTerm(self._n, config.lambda_, enabled=config.integral == "passivity")
+        self._references = References(description)
+        hand = None if config.hand_force is None else HandControl(run.robot, config.hand_force)
+        limits = JointLimits(description, config.qp.damper_s)
+        collision = None
+        if config.collision is not None:
+            collision = CollisionModel(run.robot, config.collision, self._model, limits.response_s)
+        self._qp = AccelerationQp(limits, config.qp, collision, None if hand is None else hand.variables)
+        self._tasks = TaskSet(self._frame, config)
+        self._torque_mode = TorqueMode(run, self._qp, self._references, self._tasks, hand)
+        contacts = config.observer is not None and config.observer.reaction != "none"
+        self._log = EventLog(description.joint_names, contacts=contacts)
         servo = all(joint.drive.kind == "servo" for joint in description.joints)
         self._still_mode = ControlMode.SERVO if servo else ControlMode.POSITION
         self._torque_limits: Vector = tuple(self._qp.limits.torque.tolist())
@@ -103,6 +109,14 @@ class Controller:
         self._velocity = np.zeros(self._n)
         self._acceleration = np.zeros(self._n)
         """q̈ʳ of the last tick, held since."""
+        self._torque = np.zeros(self._n)
+        """Of the last tick in torque mode."""
+        self._failure: tuple[ControllerError, float] | None = None
+        """Why torque mode ends, and for how long it has been ending [s]."""
+
+    def drain_events(self) -> list[Event]:
+        """Take the events since the last call."""
+        return self._log.drain()
 
     @property
     def stage(self) -> Stage:
@@ -115,8 +129,8 @@ class Controller:
         Raises:
             StateError: out of sequence, wrong number of joints, not finite, or without the motor torque that torque
                 mode starts from.
-            QpError: see `AccelerationQp`.
-            ControllerError: a command that is not finite.
+            ControllerError: a command that is not finite; a QP without solution, a contact that is to stop the robot, a
+                silent sensor: in torque mode these come after the robot was brought to rest.
 
         """
         measured, cycles = self._accept(state)
@@ -134,8 +148,9 @@ class Controller:
             tick = self._capture(state, time, estimate, elapsed_s, before)
         else:
             tick = self._drive(state, time, estimate, elapsed_s, before)
-        self._acceleration = tick.solution.x
-        return self._command(state, tick), self._trace(state, time, estimate, tick)
+        self._acceleration = tick.motion.acceleration
+        self._log.note(state, tick)
+        return self._command(state, tick), make_trace(state, time, estimate, tick, self._hand_trace(estimate, tick))
 
     def _accept(self, state: RobotState) -> tuple[Array, int]:
         if len(state.position_measured) != self._n:
@@ -159,19 +174,22 @@ class Controller:
     def _next_stage(self, state: RobotState, wanted: ControlMode) -> Stage:
         if state.status is not HalStatus.ACTIVE:
             return Stage.HOLD
+        if self._failure is not None:
+            return Stage.STOPPING
         if wanted is not ControlMode.TORQUE:
             return Stage.POSITION
         return Stage.TORQUE if self._stage in (Stage.CAPTURE, Stage.TORQUE) else Stage.CAPTURE
 
-    def _hold(self, state: RobotState, estimate: Estimate) -> _Tick:
+    def _hold(self, state: RobotState, estimate: Estimate) -> Tick:
+        if self._failure is not None:
+            raise self._failure[0]  # the HAL holds the robot: nothing is left to bring to rest
         now = self._model.configure(estimate.position, estimate.velocity)
         self._position, self._velocity = _firmware_target(state), np.zeros(self._n)
         self._references.forget()
         self._torques.clear()
-        solution = QpSolution(np.zeros(self._n), np.zeros(0), 0, "not solved: holding", 0.0, 0.0)
-        return self._position_tick(self._still_mode, now, solution, self._position)
+        return self._position_tick(self._still_mode, now, self._unsolved("holding"), self._position)
 
-    def _follow(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> _Tick:
+    def _follow(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
         """Position mode: (q_ref, q̇_ref) is the QP's configuration; the command is q_ref one period on."""
         if before is Stage.POSITION:
             self._position, self._velocity = self._ahead(elapsed_s)
@@ -183,56 +201,78 @@ class Controller:
                 self._position, self._velocity = estimate.position, np.zeros(self._n)
                 self._torques.clear()
         now = self._model.configure(self._position, self._velocity)
-        tasks = self._references.tasks(time, now)
-        solution = self._qp.solve(now, tasks, np.zeros(self._n), state.sequence)
-        self._acceleration = solution.x
+        motion = self._plan(now, time, state)
+        self._acceleration = motion.acceleration
         target = estimate.position if before is Stage.TORQUE else self._ahead(self._period)[0]
-        return self._position_tick(time.phase.mode, now, solution, target)
+        return self._position_tick(time.phase.mode, now, motion, target)
 
-    def _capture(
-        self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage
-    ) -> _Tick:
+    def _capture(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
         """First step of the transition: the target stands still, QP and tasks get the measured configuration."""
         self._position = self._ahead(elapsed_s)[0] if before is Stage.POSITION else _firmware_target(state)
         self._velocity = np.zeros(self._n)
         now = self._model.configure(estimate.position, estimate.velocity)
         self._references.forget()
-        tasks = self._references.tasks(time, now)
-        solution = self._qp.solve(now, tasks, np.zeros(self._n), state.sequence)
-        return self._position_tick(self._still_mode, now, solution, self._position)
+        return self._position_tick(self._still_mode, now, self._plan(now, time, state), self._position)
 
-    def _drive(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> _Tick:
-        """Torque mode, (3): u = uʳ + L s within the torque limits."""
+    def _plan(self, now: Configuration, time: PhaseTime, state: RobotState) -> ReferenceMotion:
+        """Solve the tasks of the position modes and of the capture: the schedule's, and no integral term."""
+        tasks = self._tasks.make(now, self._references.advance(time, now))
+        return self._qp.solve(now, tasks, np.zeros(self._n), state.sequence)
+
+    def _drive(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
+        """Torque mode, (3) or (21), within the torque limits; or its end."""
         now = self._model.configure(estimate.position, estimate.velocity)
-        tasks = self._references.tasks(time, now)
-        if before is Stage.TORQUE:
-            self._integral.advance(self._acceleration, elapsed_s)
-            error, integral = self._integral.terms(now)
-            solution = self._qp.solve(now, tasks, integral, state.sequence)
-            reference = inverse_dynamics(now, solution.x)
-        else:
-            solution = self._qp.solve(now, tasks, np.zeros(self._n), state.sequence)
-            reference = inverse_dynamics(now, solution.x)
-            start = self._torque_given(state, estimate) - reference if self._config.initialize_integral else None
-            self._integral.reset(now, start)
-            error, integral = self._integral.terms(now)
+        if self._failure is not None:
+            return self._stop(now, estimate, elapsed_s)
+        if before is not Stage.TORQUE:
+            # The drives are still in position mode and hold the robot, whatever is raised here
+            given = self._torque_given(state, estimate) if self._config.initialize_integral else None
+            terms = self._torque_mode.start(now, time, state, given)
             self._torques.clear()
-        limits = self._qp.limits.torque
-        torque = reference + integral
-        clipped = np.minimum(np.maximum(torque, -limits), limits)
+            self._warn_of_friction(state, now)
+            return self._torque_tick(now, estimate, terms)
+        try:
+            terms = self._torque_mode.step(now, time, state, self._acceleration, elapsed_s)
+        except ControllerError as error:
+            self._fail(state, error)
+            return self._stop(now, estimate, elapsed_s)
+        return self._torque_tick(now, estimate, terms)
+
+    def _torque_tick(self, now: Configuration, estimate: Estimate, terms: TorqueTick) -> Tick:
+        limits, torque, motion = self._qp.limits.torque, terms.torque, terms.motion
+        self._torque = np.minimum(np.maximum(torque, -limits), limits)
         if np.count_nonzero(np.abs(torque) > self._reported_torque):
-            solution = replace(solution, status=f"{solution.status}, torque clipped")
-        terms = LawTerms(error, reference, integral)
-        return _Tick(
-            ControlMode.TORQUE,
-            now,
-            solution,
-            self._integral.velocity_reference,
-            terms,
-            estimate.position,
-            None,
-            clipped,
-        )
+            status = f"{motion.solution.status}, torque clipped"
+            motion = replace(motion, solution=replace(motion.solution, status=status))
+        reference = self._torque_mode.law.velocity_reference
+        return Tick(ControlMode.TORQUE, now, motion, reference, estimate.position, None, self._torque, terms)
+
+    def _warn_of_friction(self, state: RobotState, now: Configuration) -> None:
+        if steep := self._torque_mode.steep_joints(now):
+            text = f"friction compensation is steep for slow motion of {', '.join(steep)}: raise smoothing_velocity"
+            self._log.tell(state, "friction_compensation_steep", text, "warning")
+
+    def _fail(self, state: RobotState, error: ControllerError) -> None:
+        self._failure = (error, 0.0)
+        self._stage = Stage.STOPPING
+        self._log.tell(state, "torque_mode_failed", f"{error} The robot is brought to rest.", "error")
+
+    def _stop(self, now: Configuration, estimate: Estimate, elapsed_s: float) -> Tick:
+        """τ ← g + (τ − g) e^(−t/`STOP_DECAY_S`): friction and the drives' hold do the rest."""
+        assert self._failure is not None
+        error, since_s = self._failure
+        if since_s >= STOP_S:
+            raise error
+        self._failure = (error, since_s + elapsed_s)
+        gravity = now.gravity
+        self._torque = gravity + math.exp(-elapsed_s / STOP_DECAY_S) * (self._torque - gravity)
+        reference = self._torque_mode.law.velocity_reference
+        motion = self._unsolved("stopping")
+        return Tick(ControlMode.TORQUE, now, motion, reference, estimate.position, None, self._torque, None)
+
+    def _unsolved(self, why: str) -> ReferenceMotion:
+        zero = np.zeros(self._n)
+        return ReferenceMotion(zero, None, QpSolution(zero, np.zeros(0), 0, f"not solved: {why}", 0.0, 0.0))
 
     def _torque_given(self, state: RobotState, estimate: Estimate) -> Array:
         """Return what the position loop was giving, from the motor currents (n,) [N·m]."""
@@ -251,12 +291,11 @@ class Controller:
         step = time_s * self._acceleration
         return self._position + time_s * (self._velocity + 0.5 * step), self._velocity + step
 
-    def _position_tick(self, mode: ControlMode, now: Configuration, solution: QpSolution, target: Array) -> _Tick:
-        zero = np.zeros(self._n)
-        terms = LawTerms(zero, inverse_dynamics(now, solution.x), zero)
-        return _Tick(mode, now, solution, self._velocity, terms, self._position, target, terms.reference)
+    def _position_tick(self, mode: ControlMode, now: Configuration, motion: ReferenceMotion, target: Array) -> Tick:
+        torque = inverse_dynamics(now, motion.acceleration)
+        return Tick(mode, now, motion, self._velocity, self._position, target, torque, None)
 
-    def _command(self, state: RobotState, tick: _Tick) -> JointCommand:
+    def _command(self, state: RobotState, tick: Tick) -> JointCommand:
         value = tick.torque if tick.position_command is None else tick.position_command
         vector = tuple(value.tolist())
         if not all(map(math.isfinite, vector)):
@@ -274,41 +313,16 @@ class Controller:
             torque_limit=self._torque_limits if tick.mode is ControlMode.SERVO else None,
         )
 
-    def _trace(self, state: RobotState, time: PhaseTime, estimate: Estimate, tick: _Tick) -> ControllerTrace:
-        desired, measured = self._references.hand_target, None
-        if self._frame is not None:
-            frame = tick.now.frames[self._frame]
-            open_loop = self._stage is Stage.POSITION
-            measured = _pose(
-                *(self._model.pose(estimate.position, self._frame) if open_loop else (frame.position, frame.rotation))
-            )
-        return ControllerTrace(
-            sequence=state.sequence,
-            time_ns=state.time_ns,
-            phase=time.phase.name,
-            mode=tick.mode,
-            position_estimated=state.position_measured,
-            velocity_estimated=tuple(estimate.velocity.tolist()),
-            acceleration_reference=tuple(tick.solution.x.tolist()),
-            velocity_reference=tuple(tick.velocity_reference.tolist()),
-            velocity_error=tuple(tick.terms.velocity_error.tolist()),
-            torque_reference=tuple(tick.terms.reference.tolist()),
-            torque_integral=tuple(tick.terms.integral.tolist()),
-            torque_commanded=tuple(tick.torque.tolist()),
-            position_reference=tuple(tick.position_reference.tolist()),
-            hand_desired=None if desired is None else _pose(desired.position, desired.rotation),
-            hand_estimated=measured,
-            qp_iterations=tick.solution.iterations,
-            qp_primal_residual=tick.solution.primal_residual,
-            qp_dual_residual=tick.solution.dual_residual,
-            qp_status=tick.solution.status,
-        )
+    def _hand_trace(self, estimate: Estimate, tick: Tick) -> HandTrace:
+        """Desired and estimated pose of the hand; in position mode the configuration is the reference's."""
+        if self._frame is None:
+            return HandTrace(None, None)
+        frame = tick.now.frames[self._frame]
+        pose = frame.position, frame.rotation
+        if self._stage is Stage.POSITION:
+            pose = self._model.pose(estimate.position, self._frame)
+        return HandTrace(self._references.hand_target, pose)
 
 
 def _firmware_target(state: RobotState) -> Array:
     return np.array(state.position_measured if state.applied.position is None else state.applied.position)
-
-
-def _pose(position: Array, rotation: Array) -> PoseSample:
-    px, py, pz, x, y, z, w = pin.SE3ToXYZQUATtuple(pin.SE3(rotation, position))
-    return PoseSample(position_in_world=(px, py, pz), orientation_to_world=(w, x, y, z))

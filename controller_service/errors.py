@@ -32,3 +32,23 @@ class QpError(ControllerError):
         self.status = status
         self.primal_residual = primal_residual
         self.dual_residual = dual_residual
+
+
+class ContactError(ControllerError):
+    """The observer's external torque is over a threshold whose reaction is to stop.
+
+    Attributes:
+        joint: its name.
+        torque: estimated [N·m].
+        threshold: [N·m].
+
+    """
+
+    def __init__(self, joint: str, torque: float, threshold: float, sequence: int) -> None:
+        super().__init__(
+            f"state {sequence}: {joint} feels {torque:.1f} N·m from outside, more than its threshold of"
+            f" {threshold:.1f} N·m, and controller.observer.reaction is stop. Free the robot and start again."
+        )
+        self.joint = joint
+        self.torque = torque
+        self.threshold = threshold

@@ -164,7 +164,8 @@ def _polish(
         point_Ax = A.dot(point)
         slack = 1e-9 * (1.0 + np.abs(point_Ax))
         wrong = (at_upper & (y < 0.0)) | (at_lower & (y > 0.0))
-        over, under = point_Ax > upper + slack, point_Ax < lower - slack
+        # Active rows are at their bound but for rounding, which may be more than the slack
+        over, under = (point_Ax > upper + slack) & ~at_upper, (point_Ax < lower - slack) & ~at_lower
         if not np.count_nonzero(wrong | over | under):
             return point, y
         if done >= BLOCK_PASSES:  # one row at a time, lest the set goes round in circles

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller_service.model import Configuration
-from controller_service.reference import HandMotion, PostureMotion, hand_motion
-from controller_service.tasks import FRAME_TASKS, PoseTarget, PostureTarget, PostureTask, Task
+from controller_service.reference import HandHold, HandMotion, PostureMotion, hand_motion
+from controller_service.tasks import PoseTarget, PostureTarget
 from schemas.base import ControlMode
-from schemas.controller import ControllerConfig, Phase
+from schemas.controller import Phase
 from schemas.errors import ConfigurationError
 from schemas.robot import RobotDescription
 
@@ -70,6 +70,15 @@ class Schedule:
         return PhaseTime(index, self._phases[index], (sequence - self._starts[index]) * self._period)
 
 
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """What the tasks of a tick are to reach."""
+
+    posture: PostureTarget
+    hand: PoseTarget | None
+    """None while the hand task does not run."""
+
+
 class References:
     """Desired posture and hand pose, kept without a jump from phase to phase.
 
@@ -77,10 +86,9 @@ class References:
     hold posture and hand); a phase that only moves the posture leaves the hand free.
     """
 
-    def __init__(self, description: RobotDescription, config: ControllerConfig) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         self._names = description.joint_names
         self._frame = description.hand_frame
-        self._config = config
         self._index = -1
         self._origin = 0.0
         self._end = 0.0
@@ -97,19 +105,29 @@ class References:
         self.posture_target = None
         self.hand_target = None
 
-    def tasks(self, time: PhaseTime, now: Configuration) -> tuple[Task, ...]:
-        """Make the tasks of a tick at a configuration."""
+    def advance(self, time: PhaseTime, now: Configuration) -> Targets:
+        """Give the targets of a tick at a configuration."""
         if time.index != self._index or self._posture is None:
             self._enter(time, now)
         elapsed = time.since_start_s - self._origin
         assert self._posture is not None
         self.posture_target = self._posture.at(elapsed)
-        posture = PostureTask(now, self.posture_target, self._config.posture)
-        if self._hand is None or self._frame is None:
-            return (posture,)
-        self.hand_target = self._hand.at(elapsed)
-        task = FRAME_TASKS[self._config.hand_task]
-        return posture, task(now, self._frame, self.hand_target, self._config.hand)
+        self.hand_target = None if self._hand is None else self._hand.at(elapsed)
+        return Targets(self.posture_target, self.hand_target)
+
+    def follow_hand(self, now: Configuration, directions: tuple[bool, ...]) -> None:
+        """Take the hand's present place for the one to hold, until a phase with another motion of it begins.
+
+        Args:
+            now: configuration.
+            directions: (6,) which of the position's world directions follow; the orientation follows if all three do.
+
+        """
+        if self._hand is None or self._frame is None or self.hand_target is None:
+            return
+        frame, target = now.frames[self._frame], self.hand_target
+        position = np.where(directions[:3], frame.position, target.position)
+        self._hand = HandHold(position, frame.rotation if all(directions[3:]) else target.rotation)
 
     def _enter(self, time: PhaseTime, now: Configuration) -> None:
         phase = time.phase

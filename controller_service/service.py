@@ -45,6 +45,8 @@ def run_controller(run: Run, options: ServiceOptions) -> int:
                 command, trace = controller.step(state)
                 transport.publish(keys.command, command)
                 transport.publish(keys.trace, trace)
+                for event in controller.drain_events():
+                    life.publish(keys.event, event)
                 ended = time.perf_counter()
                 meter.cycle(ended - begun)
                 if (summary := meter.report(state.sequence, state.time_ns, ended)) is not None:

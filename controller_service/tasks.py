@@ -82,6 +82,27 @@ class PostureTask:
         return objective
 
 
+class InertialPostureTask(PostureTask):
+    """(6) in the metric of M: w (q̈ − q̈^ob)ᵀ M (q̈ − q̈^ob).
+
+    Beside a task J q̈ = b of much larger weight, q̈ = q̈^ob + M⁻¹Jᵀ(J M⁻¹Jᵀ)⁻¹(b − J q̈^ob): the dynamically consistent
+    inverse, so the torque M q̈ that the task costs is Jᵀ f, and zᵀJᵀ f = 0 for every z of its null space.
+    """
+
+    __slots__ = ()
+
+    def linear(self) -> tuple[Array, Array]:
+        """Return A = Lᵀ, b = Lᵀ q̈^ob with M = L Lᵀ."""
+        root = np.asarray(np.linalg.cholesky(self.configuration.mass).T, np.float64)
+        return root, root.dot(self._objective())
+
+    def add_to(self, P: Array, q: Array) -> None:
+        """Add w M to P and −w M q̈^ob to q, in place."""
+        weighted = self.gains.weight * self.configuration.mass
+        P += weighted
+        q -= weighted.dot(self._objective())
+
+
 @dataclass(frozen=True, slots=True)
 class PoseTask:
     """Position (7) and orientation (8) of a frame; A = J, b = [v̇^ob; ω̇^ob] − J̇ q̇ (9), (6, n) and (6,)."""

@@ -60,6 +60,8 @@ class InProcess:
         command, trace = self.controller.step(state)
         self._sink("command", command)
         self._sink("trace", trace)
+        for event in self.controller.drain_events():
+            self._sink("event", event)
         self.master.apply(command)
         self._close_cycle()
 

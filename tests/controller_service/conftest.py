@@ -15,7 +15,15 @@ from controller_service.controller import Controller
 from controller_service.model import Array, RobotModel
 from schemas.base import ControlMode
 from schemas.load import Robot, Run
-from schemas.messages import AppliedCommand, ControllerTrace, DriveState, HalStatus, JointCommand, RobotState
+from schemas.messages import (
+    AppliedCommand,
+    ControllerTrace,
+    DriveState,
+    HalStatus,
+    JointCommand,
+    RobotState,
+    WrenchSample,
+)
 from schemas.robot import RobotDescription
 from schemas.scenario import Scenario
 
@@ -116,6 +124,8 @@ class Plant:
     substeps: int = 4
     velocity: Array = field(init=False)
     motor_torque: Array = field(init=False)
+    external: Array = field(init=False)
+    """Torque of the environment at the joints (n,) [N·m], held from one `advance` to the next; zero until set."""
 
     def __post_init__(self) -> None:
         description = self.run.robot.description
@@ -131,6 +141,7 @@ class Plant:
         self.limit = np.array([joint.torque_limit for joint in description.joints])
         self.velocity = np.zeros_like(self.position)
         self.motor_torque = np.zeros_like(self.position)
+        self.external = np.zeros_like(self.position)
 
     def advance(self, period: float, position: Array | None, torque: Array | None) -> None:
         model, data, dt = self.rigid.model, self.rigid.data, period / self.substeps
@@ -149,7 +160,8 @@ class Plant:
             drag = self.gear**2 * self.viscous * self.velocity
             bias = pin.nonLinearEffects(model, data, self.position, self.velocity)
             stiffness = dt * self.kp * self.velocity if position is not None else 0.0
-            free = self.velocity + dt * inverse @ (self.torque_scale * self.motor_torque - drag - bias - stiffness)
+            driving = self.torque_scale * self.motor_torque + self.external
+            free = self.velocity + dt * inverse @ (driving - drag - bias - stiffness)
             impulse = np.zeros_like(free)
             if self.coulomb > 0.0:
                 for _ in range(6):
@@ -173,6 +185,8 @@ class Loop:
     torques: list[Array] = field(default_factory=list)
     positions: list[Array] = field(default_factory=list)
     status: Callable[[int], HalStatus] = lambda _: HalStatus.ACTIVE
+    wrenches: Callable[[int], tuple[WrenchSample, ...]] = lambda _: ()
+    """Readings of the force/torque sensors at a sequence."""
 
     def __post_init__(self) -> None:
         self.controller = Controller(self.run, "session")
@@ -195,6 +209,7 @@ class Loop:
             mode=(self.applied.mode,) * n,
             error_code=(0,) * n,
             applied=self.applied,
+            wrenches=self.wrenches(self.sequence),
         )
 
     def cycle(self) -> None:
@@ -247,8 +262,14 @@ def run_of() -> Callable[..., Run]:
 def loop_of() -> Callable[..., Loop]:
     """loop_of(controller configuration, **plant) at `START`."""
 
-    def build(controller: dict[str, Any], *, description: RobotDescription | None = None, **plant: Any) -> Loop:
-        run = make_run(controller, description)
+    def build(
+        controller: dict[str, Any],
+        *,
+        description: RobotDescription | None = None,
+        urdf: str | None = None,
+        **plant: Any,
+    ) -> Loop:
+        run = make_run(controller, description, urdf)
         counts, report = plant.pop("counts", True), plant.pop("report_torque", True)
         return Loop(run, Plant(run, START.copy(), **plant), counts=counts, report_torque=report)
 

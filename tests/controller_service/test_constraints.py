@@ -1,4 +1,4 @@
-"""Limits as rows: torque with the integral term, speed, range, always lower ≤ upper."""
+"""Limits as bounds: torque beside what the law adds, speed and range with and without u_K, always lower ≤ upper."""
 
 from __future__ import annotations
 
@@ -21,30 +21,49 @@ def at(arm: Robot, q: float, v: float) -> Configuration:
     return RobotModel(arm).configure(np.full(9, q), np.full(9, v))
 
 
-def test_torque_rows_hold_exactly_when_the_whole_torque_is_within_its_limit(arm: Robot, limits: JointLimits) -> None:
+def test_torque_bounds_are_met_exactly_when_the_whole_torque_is_within_its_limit(
+    arm: Robot, limits: JointLimits
+) -> None:
     now = at(arm, 0.3, 0.4)
-    integral = np.linspace(-40.0, 40.0, 9)
-    rows = limits.rows(now, integral)
-    for torque in (limits.torque, -limits.torque):
-        acceleration = np.linalg.solve(now.mass, torque - now.nonlinear - integral)
-        reached = (rows.A @ acceleration)[9:]
-        edge = rows.upper[9:] if torque[0] > 0 else rows.lower[9:]
-        assert np.allclose(reached, edge)
-    bare = rows.without_kinematics()
-    assert np.isinf(bare.lower[:9]).all()
-    assert np.isinf(bare.upper[:9]).all()
-    assert np.array_equal(bare.upper[9:], rows.upper[9:])
+    added = np.linspace(-40.0, 40.0, 9)
+    lower, upper = limits.torque_bounds(now, added)
+    for torque, edge in ((limits.torque, upper), (-limits.torque, lower)):
+        acceleration = np.linalg.solve(now.mass, torque - now.nonlinear - added)
+        assert np.allclose(now.mass @ acceleration, edge)
+    assert np.allclose(limits.torque_bounds(now, np.zeros(9)) - (lower, upper), added)
 
 
 @pytest.mark.parametrize("q", [-4.0, -2.6, -2.499, -1.0, 0.0, 2.49, 2.5, 2.51, 9.0])
 @pytest.mark.parametrize("v", [-5.0, -1.0, 0.0, 3.0, 8.0])
 def test_bounds_never_cross(arm: Robot, limits: JointLimits, q: float, v: float) -> None:
-    lower, upper = limits.acceleration_bounds(at(arm, q, v))
+    now = at(arm, q, v)
+    lower, upper = limits.acceleration_bounds(now)
     assert (lower <= upper).all()
+    for size in (1.0, 50.0, 5000.0):
+        narrowed = limits.acceleration_bounds(now, size * np.linspace(-1.0, 1.0, 9))
+        assert (narrowed[0] <= narrowed[1]).all()
     if q > 2.5 and v == 0.0:
         assert (upper < 0.0).all()
     if q < -2.5 and v == 0.0:
         assert (lower > 0.0).all()
+
+
+def test_the_reference_and_the_motion_without_the_disturbance_both_keep_the_bounds(
+    arm: Robot, limits: JointLimits
+) -> None:
+    """Every q̈ʳ within the narrowed bounds: l ≤ q̈ʳ ≤ u and l ≤ q̈ʳ + M⁻¹u_K ≤ u; one at each end is on the edge."""
+    model, rng = RobotModel(arm), np.random.default_rng(24)
+    for _ in range(200):
+        now = model.configure(rng.uniform(-2.45, 2.45, 9), rng.uniform(-3.0, 3.0, 9))
+        caused = rng.normal(scale=20.0, size=9)
+        wide, narrow = limits.acceleration_bounds(now), limits.acceleration_bounds(now, caused)
+        for end in narrow:
+            for acceleration in (end, end + caused):
+                assert (wide[0] - 1e-9 <= acceleration).all()
+                assert (acceleration <= wide[1] + 1e-9).all()
+        assert np.allclose(np.minimum(narrow[0], narrow[0] + caused), wide[0])
+        assert np.allclose(np.maximum(narrow[1], narrow[1] + caused), wide[1])
+        assert np.array_equal(limits.acceleration_bounds(now, np.zeros(9)), wide)
 
 
 def test_a_joint_beyond_its_range_changes_no_other_joints_bounds(arm: Robot, limits: JointLimits) -> None:

@@ -138,6 +138,27 @@ def test_torque_limits_hold_whatever_the_tasks_want(loop_of: Callable[..., Any])
     assert (np.abs(torques) > 0.99 * loop.plant.limit).any()
 
 
+def test_a_limit_that_cannot_be_kept_is_in_every_trace_but_told_once_a_second(loop_of: Callable[..., Any]) -> None:
+    """Somebody stronger than its motor turns joint 5 beyond its range and keeps it there."""
+    phases = [THERE_AND_BACK["phases"][0], {"name": "torque", "mode": "torque", "duration_s": 9.0}]
+    loop = loop_of(GAINS | {"phases": phases}).go(UP + 20)
+    plant = loop.plant
+    for k in range(1600):
+        angle = min(-1.2 + 0.006 * k, 2.7)
+        plant.external[5] = 8000.0 * (angle - plant.position[5]) - 300.0 * plant.velocity[5]
+        loop.cycle()
+    name = "range or speed of joint5"
+    relaxed = [trace.sequence for trace in loop.traces if name in trace.relaxed]
+    assert len(relaxed) > 800
+    assert relaxed[-1] == loop.sequence - 1
+    told = [event for event in loop.controller.drain_events() if event.text.startswith(name)]
+    assert [event.sequence for event in told] == [relaxed[0], *[at for at in (relaxed[0] + 500,) if at in relaxed]]
+    assert {(event.kind, event.severity) for event in told} == {("constraint_relaxed", "warning")}
+    torques = np.array([command.torque for command in loop.commands if command.torque is not None])
+    assert (np.abs(torques) <= plant.limit).all()
+    assert np.allclose(torques[-200:, 5], -plant.limit[5], rtol=1e-3)
+
+
 def test_same_states_same_answers_to_the_bit_and_valid_messages(loop_of: Callable[..., Any]) -> None:
     one, other = (loop_of(THERE_AND_BACK, **ROUGH).go(150) for _ in range(2))
     assert [c.model_dump_json() for c in one.commands] == [c.model_dump_json() for c in other.commands]

@@ -41,6 +41,18 @@ def test_jacobian_and_drift_agree_with_finite_differences(model: RobotModel, q: 
 
 
 @pytest.mark.parametrize(("q", "v"), states())
+def test_the_jacobian_s_rate_agrees_with_finite_differences(model: RobotModel, q: Array, v: Array) -> None:
+    """J̇ along q̇; J̇ q̇ is the drift."""
+    after, before = (model.configure(q + sign * STEP * v, v).frames["hand"].jacobian for sign in (1, -1))
+    frame = model.configure(q, v).frames["hand"]
+    assert np.abs(frame.jacobian_rate).max() > 0.1
+    assert np.allclose(frame.jacobian_rate, (after - before) / (2 * STEP), atol=1e-7)
+    assert np.allclose(frame.jacobian_rate @ v, frame.drift)
+    still = model.configure(q, np.zeros(9)).frames["hand"]
+    assert not still.jacobian_rate.any()
+
+
+@pytest.mark.parametrize(("q", "v"), states())
 def test_mass_rate_minus_twice_coriolis_is_skew(model: RobotModel, q: Array, v: Array) -> None:
     after, before = (model.configure(q + sign * STEP * v, v).mass for sign in (1, -1))
     skew = (after - before) / (2 * STEP) - 2.0 * model.configure(q, v).coriolis
@@ -71,6 +83,7 @@ def test_the_description_s_order_is_kept_when_the_urdf_s_differs(arm: Robot) -> 
     assert np.allclose(one.coriolis[np.ix_(order, order)], other.coriolis)
     assert np.allclose(one.nonlinear[order], other.nonlinear)
     assert np.allclose(one.frames["hand"].jacobian[:, order], other.frames["hand"].jacobian)
+    assert np.allclose(one.frames["hand"].jacobian_rate[:, order], other.frames["hand"].jacobian_rate)
     assert np.allclose(one.frames["hand"].drift, other.frames["hand"].drift)
     assert np.allclose(straight.pose(q, "hand")[0], shuffled.pose(q[order], "hand")[0])
 
@@ -78,11 +91,14 @@ def test_the_description_s_order_is_kept_when_the_urdf_s_differs(arm: Robot) -> 
 def test_a_configuration_cannot_be_written_and_outlives_the_next(model: RobotModel) -> None:
     (q, v), (q2, v2) = states(2)
     now = model.configure(q, v)
-    mass = now.mass.copy()
+    hand = now.frames["hand"]
+    arrays = (now.mass, now.coriolis, now.nonlinear, hand.jacobian, hand.jacobian_rate, hand.drift, hand.velocity)
+    kept = [array.copy() for array in arrays]
     model.configure(q2, v2)
-    assert np.array_equal(now.mass, mass)
-    with pytest.raises(ValueError, match="read-only"):
-        now.mass[0, 0] = 0.0
+    assert all(np.array_equal(array, copy) for array, copy in zip(arrays, kept, strict=True))
+    for array in arrays:
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
 
 
 def test_what_does_not_fit_is_refused(model: RobotModel, arm: Robot) -> None:
