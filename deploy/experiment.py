@@ -1,16 +1,18 @@
-"""What an experiment is: a module of `experiments` with a function `run`, and the result each of them gives."""
+"""What an experiment is: a module of `experiments` with a function `run`; its result, and those of several seeds."""
 
 from __future__ import annotations
 
 import importlib
 import math
 import pkgutil
-from collections.abc import Callable
+import statistics
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from deploy.errors import UsageError
+from deploy.variation import varied
 
 Metric = float | int | str | bool | None | list[float] | dict[str, float]
 
@@ -29,12 +31,17 @@ class Bar:
         """False for a value that is not a number, too."""
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
+    @property
+    def margin(self) -> float:
+        """How far the value may still go, negative where the limit is passed; −∞ for a value that is not a number."""
+        margin = self.value - self.limit if self.at_least else self.limit - self.value
+        return -math.inf if math.isnan(margin) else margin
+
     def as_json(self) -> dict[str, Any]:
         """Plain values; a value that is not finite is null."""
-        value = self.value if math.isfinite(self.value) else None
         return {
             "name": self.name,
-            "value": value,
+            "value": _finite(self.value),
             "limit": self.limit,
             "at_least": self.at_least,
             "holds": self.holds,
@@ -77,15 +84,63 @@ class ExperimentResult:
         return all(bar.holds for bar in self.bars)
 
     def as_json(self) -> dict[str, Any]:
-        """Make the printed JSON object."""
+        """Make the printed JSON object; numbers that are not finite are null."""
         return {
             "experiment": self.experiment,
             "robot": self.robot,
             "seed": self.seed,
             "versions": self.versions,
-            "metrics": self.metrics,
+            "metrics": _finite(self.metrics),
             "bars": [bar.as_json() for bar in self.bars],
             "passed": self.passed,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class FailedRun:
+    """A seed whose run came to no result."""
+
+    seed: int
+    error: str
+
+    @property
+    def passed(self) -> bool:
+        """Never."""
+        return False
+
+    def as_json(self) -> dict[str, Any]:
+        """Make the entry of the printed JSON object."""
+        return {"seed": self.seed, "error": self.error}
+
+
+Outcome = ExperimentResult | FailedRun
+
+
+@dataclass(frozen=True, slots=True)
+class BarSummary:
+    """A bar over several seeds; `limit` is that of the worst one, the same for all where an experiment has it fixed."""
+
+    name: str
+    limit: float
+    at_least: bool
+    holds_count: int
+    """Seeds in which it holds; a seed without result is none of them."""
+    worst: float
+    """The value with the least margin; one that is not a number is the worst there is."""
+    worst_seed: int
+    median: float
+    """Of the seeds with a result; a value that is not a number counts as infinitely bad."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; a value that is not finite is null."""
+        return {
+            "name": self.name,
+            "limit": self.limit,
+            "at_least": self.at_least,
+            "holds_count": self.holds_count,
+            "worst": _finite(self.worst),
+            "worst_seed": self.worst_seed,
+            "median": _finite(self.median),
         }
 
 
@@ -93,14 +148,8 @@ Experiment = Callable[[ExperimentRequest], ExperimentResult]
 
 
 def experiment_names() -> list[str]:
-    """List the experiments that come with the package: modules of `experiments` with a function `run`."""
-    import experiments
-
-    return sorted(
-        module.name
-        for module in pkgutil.iter_modules(experiments.__path__)
-        if hasattr(importlib.import_module(f"experiments.{module.name}"), "run")
-    )
+    """List the experiments that come with the package: modules of `experiments` with a function `run`, `_` as `-`."""
+    return [name for name in _module_names() if hasattr(_import(name), "run")]
 
 
 def find_experiment(name: str) -> Experiment:
@@ -110,21 +159,89 @@ def find_experiment(name: str) -> Experiment:
         UsageError: there is none of this name.
 
     """
-    names = experiment_names()
-    if name not in names:
-        raise UsageError(f"no experiment {name!r}; there are {', '.join(names) or 'none'}")
-    run: Experiment = importlib.import_module(f"experiments.{name}").run
+    run: Experiment | None = getattr(_import(name), "run", None) if name in _module_names() else None
+    if run is None:
+        raise UsageError(f"no experiment {name!r}; there are {', '.join(experiment_names()) or 'none'}")
     return run
 
 
-def combine(results: list[ExperimentResult]) -> dict[str, Any]:
-    """One entry a seed, and the counts."""
-    passed = sum(result.passed for result in results)
+def seed_requests(
+    seeds: Sequence[int],
+    overrides: dict[str, Any],
+    directory: Path,
+    *,
+    vary: bool,
+    processes: bool = False,
+    apart: bool = True,
+) -> list[ExperimentRequest]:
+    """Prepare a run for every seed, and make its directory: `seed-N` below `directory`, itself unless `apart`.
+
+    With `vary` every seed has a plant of its own, but for the fields that `overrides` sets.
+
+    Raises:
+        UsageError: a directory cannot be made.
+
+    """
+    requests = []
+    for seed in seeds:
+        place = directory / f"seed-{seed}" if apart else directory
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"--out {place}: cannot be made: {error.strerror}") from error
+        requests.append(ExperimentRequest(seed, varied(overrides, seed) if vary else overrides, place, processes))
+    return requests
+
+
+def summarize(outcomes: Sequence[Outcome]) -> tuple[BarSummary, ...]:
+    """Every bar over all seeds, in the order in which they come."""
+    bars: dict[str, list[tuple[int, Bar]]] = {}
+    for outcome in outcomes:
+        if isinstance(outcome, ExperimentResult):
+            for bar in outcome.bars:
+                bars.setdefault(bar.name, []).append((outcome.seed, bar))
+    summaries = []
+    for name, of_seeds in bars.items():
+        seed, worst = min(of_seeds, key=lambda entry: entry[1].margin)
+        bad = -math.inf if worst.at_least else math.inf
+        median = statistics.median(bad if math.isnan(bar.value) else bar.value for _, bar in of_seeds)
+        held = sum(bar.holds for _, bar in of_seeds)
+        summaries.append(BarSummary(name, worst.limit, worst.at_least, held, worst.value, seed, median))
+    return tuple(summaries)
+
+
+def combine(experiment: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Make the printed JSON object of several seeds: counts, every bar over all of them, one entry a seed."""
+    passed = sum(outcome.passed for outcome in outcomes)
+    robots = [outcome.robot for outcome in outcomes if isinstance(outcome, ExperimentResult)]
     return {
-        "experiment": results[0].experiment,
-        "robot": results[0].robot,
-        "seeds": len(results),
+        "experiment": experiment,
+        "robot": robots[0] if robots else None,
+        "seeds": len(outcomes),
         "seeds_passed": passed,
-        "passed": passed == len(results),
-        "runs": [result.as_json() for result in results],
+        "passed": passed == len(outcomes),
+        "bars": [bar.as_json() for bar in summarize(outcomes)],
+        "runs": [outcome.as_json() for outcome in outcomes],
     }
+
+
+def _module_names() -> list[str]:
+    """Names of the modules of `experiments` as experiments would have them."""
+    import experiments
+
+    return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(experiments.__path__))
+
+
+def _import(name: str) -> Any:
+    return importlib.import_module(f"experiments.{name.replace('-', '_')}")
+
+
+def _finite(value: Any) -> Any:
+    """Put None for every number that is not finite: JSON has none."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
+    return value

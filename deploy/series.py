@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +15,13 @@ from schemas.load import Run
 from schemas.log import LogReader
 from schemas.messages import (
     BusStatistics,
+    ContactSample,
     ControllerTrace,
     CycleStatistics,
     Event,
     JointCommand,
     PlantTruth,
+    PoseSample,
     RobotState,
 )
 from schemas.topics import LOAD_PREFIX, decode
@@ -37,6 +40,8 @@ class StateSeries:
     """(K, n) [rad], measured."""
     motor_torque: Array
     """(K, n) [N·m], measured; NaN where the drives report none."""
+    wrench: Array
+    """(K, 6) [N, N·m] of the first force/torque sensor, in its frame; NaN without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +56,23 @@ class TraceSeries:
     """uʳ (K, n) [N·m]."""
     torque_integral: Array
     """L s (K, n) [N·m]."""
+    torque_windup: Array
+    """u_K (K, n) [N·m] before its limit; NaN outside torque mode, as the next two."""
+    torque_limited: Array
+    """ũ_K (K, n) [N·m]."""
+    windup_bound: Array
+    """(K, n) [N·m]."""
+    null_space_share: Array
+    """σ (K,)."""
+    admittance: npt.NDArray[np.bool_]
     torque_commanded: Array
     """u (K, n) [N·m]."""
     position_reference: Array
     """(K, n) [rad]."""
     hand_desired: Array
     """(K, 3) [m] in the world; NaN without a hand task."""
+    orientation_desired: Array
+    """(K, 4) quaternion (w, x, y, z); NaN without a hand task."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +89,16 @@ class TruthSeries:
     """(K, S, n) [N·m]; NaN at sequence 0."""
     hand: Array
     """(K, 3) [m] in the world; NaN without a hand frame."""
+    hand_orientation: Array
+    """(K, 4) quaternion (w, x, y, z); NaN without a hand frame."""
+    frames: dict[str, Array]
+    """(K, 3) [m] in the world of every reported frame."""
+    world_forces: dict[str, Array]
+    """(K, 3) [N] of every event of the world that acted, 0 while it did not."""
+    contacts: tuple[tuple[ContactSample, ...], ...]
+    """Of each cycle, between the robot's links and what they touch."""
+    kinetic_energy: Array
+    """(K,) [J]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,12 +174,13 @@ def state_series(states: list[RobotState], n: int) -> StateSeries:
         time_s=_seconds([s.time_ns for s in states]),
         position=_rows([s.position_measured for s in states], n),
         motor_torque=_rows([s.motor_torque_measured or absent for s in states], n),
+        wrench=_rows([_wrench(s) for s in states], 6),
     )
 
 
 def trace_series(traces: list[ControllerTrace], n: int) -> TraceSeries:
     """Stack traces of n joints."""
-    absent = (np.nan,) * 3
+    absent, nothing = (np.nan,) * 3, (np.nan,) * n
     return TraceSeries(
         sequence=np.array([t.sequence for t in traces], np.int64),
         time_s=_seconds([t.time_ns for t in traces]),
@@ -161,9 +188,15 @@ def trace_series(traces: list[ControllerTrace], n: int) -> TraceSeries:
         torque_mode=np.array([t.mode is ControlMode.TORQUE for t in traces], np.bool_),
         torque_reference=_rows([t.torque_reference for t in traces], n),
         torque_integral=_rows([t.torque_integral for t in traces], n),
+        torque_windup=_rows([t.torque_windup or nothing for t in traces], n),
+        torque_limited=_rows([t.torque_limited or nothing for t in traces], n),
+        windup_bound=_rows([t.windup_bound or nothing for t in traces], n),
+        null_space_share=np.array([t.null_space_share for t in traces], np.float64),
+        admittance=np.array([t.admittance for t in traces], np.bool_),
         torque_commanded=_rows([t.torque_commanded for t in traces], n),
         position_reference=_rows([t.position_reference for t in traces], n),
         hand_desired=_rows([t.hand_desired.position_in_world if t.hand_desired else absent for t in traces], 3),
+        orientation_desired=_orientations([t.hand_desired for t in traces]),
     )
 
 
@@ -176,6 +209,9 @@ def truth_series(truths: list[PlantTruth], n: int, hand_frame: str | None) -> Tr
         if len(truth.motor_torque_substeps) == substeps and substeps:
             torque[k] = truth.motor_torque_substeps
     hands = [t.frames.get(hand_frame) if hand_frame else None for t in truths]
+    frames = truths[0].frames if truths else {}
+    forces = dict.fromkeys(name for t in truths for name in t.world_forces)
+    still = (0.0,) * 3
     return TruthSeries(
         sequence=np.array([t.sequence for t in truths], np.int64),
         time_s=_seconds([t.time_ns for t in truths]),
@@ -183,10 +219,25 @@ def truth_series(truths: list[PlantTruth], n: int, hand_frame: str | None) -> Tr
         mode=np.array([t.mode for t in truths], np.int64).reshape(len(truths), n),
         motor_torque_substeps=torque,
         hand=_rows([hand.position_in_world if hand else absent for hand in hands], 3),
+        hand_orientation=_orientations(hands),
+        frames={name: _rows([t.frames[name].position_in_world for t in truths], 3) for name in frames},
+        world_forces={name: _rows([t.world_forces.get(name, still) for t in truths], 3) for name in forces},
+        contacts=tuple(t.contacts for t in truths),
+        kinetic_energy=np.array([t.kinetic_energy for t in truths], np.float64),
     )
 
 
-def _rows(values: list[tuple[float, ...]] | list[tuple[float, float, float]], n: int) -> Array:
+def _wrench(state: RobotState) -> tuple[float, ...]:
+    if not state.wrenches:
+        return (np.nan,) * 6
+    return state.wrenches[0].force_in_sensor + state.wrenches[0].torque_in_sensor
+
+
+def _orientations(poses: Sequence[PoseSample | None]) -> Array:
+    return _rows([pose.orientation_to_world if pose else (np.nan,) * 4 for pose in poses], 4)
+
+
+def _rows(values: Sequence[tuple[float, ...]], n: int) -> Array:
     return np.array(values, np.float64).reshape(len(values), n)
 
 

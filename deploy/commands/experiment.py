@@ -1,12 +1,26 @@
-"""`cosim experiment`: one of the papers' experiments."""
+"""`cosim experiment`: one of the papers' experiments; and what it shares with `cosim sweep`."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
 from deploy.commands import options as opt
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from deploy.experiment import Outcome
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="E.g. `transition`; a wrong name lists them all.")]
+FirstSeed = Annotated[int, typer.Option(min=0, help="Seed, or the first of several.")]
+
+FILE_WIDTH = 120
+"""Columns of what is printed into a file or a pipe."""
 
 
 def register(app: typer.Typer) -> None:
@@ -15,55 +29,38 @@ def register(app: typer.Typer) -> None:
 
 
 def experiment(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="E.g. `transition`; a wrong name lists them all.")],
-    seed: Annotated[int, typer.Option(min=0, help="Seed, or the first of several.")] = 0,
+    name: Name,
+    seed: FirstSeed = 0,
     seeds: Annotated[int, typer.Option(min=1, help="How many seeds in a row.")] = 1,
+    vary: Annotated[
+        bool, typer.Option("--vary", help="Each seed has the plant that it has in `cosim sweep`, not the scenario's.")
+    ] = False,
     sets: opt.Set = None,
     out: opt.Out = None,
     processes: Annotated[bool, typer.Option("--processes", help="Services as separate processes.")] = False,
     json_: opt.Json = False,
 ) -> None:
     """Run an experiment, compare its metrics with their limits; exits 1 when one does not hold."""
-    from pathlib import Path
+    from dataclasses import replace
+    from functools import partial
 
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
-    from deploy.errors import UsageError
-    from deploy.experiment import ExperimentRequest, combine, find_experiment
+    from deploy.experiment import combine, find_experiment, seed_requests
 
     run = find_experiment(name)
     directory = out or Path("runs") / name
-    overrides = opt.overrides(sets)
-    stderr = Console(stderr=True)
-    results = []
-    display = Progress(
-        TextColumn("[bold]experiment {task.fields[experiment]}"),
-        BarColumn(bar_width=30),
-        TaskProgressColumn(),
-        TextColumn("seed {task.fields[seed]}, {task.description}"),
-        TimeElapsedColumn(),
-        console=stderr,
-        disable=not stderr.is_terminal,
-        transient=True,
+    requests = seed_requests(
+        range(seed, seed + seeds), opt.overrides(sets), directory, vary=vary, processes=processes, apart=seeds > 1
     )
-    with display:
-        task = display.add_task("starting", total=float(seeds), experiment=name, seed=seed)
-        for index in range(seeds):
-
-            def tell(share: float, what: str, index: int = index) -> None:
-                display.update(task, completed=index + share, description=what, seed=seed + index)
-
-            place = directory if seeds == 1 else directory / f"seed-{seed + index}"
-            try:
-                place.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise UsageError(f"--out {place}: cannot be made: {error.strerror}") from error
-            results.append(run(ExperimentRequest(seed + index, overrides, place, processes, tell)))
-            opt.write_json(results[-1].as_json(), place / "metrics.json")
+    results = []
+    with SeedsDisplay(f"experiment {name}", seeds) as display:
+        for request in requests:
+            results.append(run(replace(request, progress=partial(display.tell, request.seed))))
+            display.done(results[-1])
+            write_outcome(results[-1], request.directory)
     if json_:
-        opt.print_json(results[0].as_json() if seeds == 1 else combine(results))
+        opt.print_json(results[0].as_json() if seeds == 1 else combine(name, results))
     else:
         table = Table(title=f"{name} on {results[0].robot}", title_justify="left")
         for header in ("seed", "what", "value", "limit", "holds"):
@@ -72,7 +69,96 @@ def experiment(
             for bar in result.bars:
                 sign, verdict = "≥" if bar.at_least else "≤", "[green]yes" if bar.holds else "[red]no"
                 table.add_row(str(result.seed), bar.name, f"{bar.value:.4g}", f"{sign} {bar.limit:.4g}", verdict)
-        Console().print(table)
+        show(table)
+        if seeds > 1:
+            show(summary(name, results))
         typer.echo(directory)
     if not all(result.passed for result in results):
         raise typer.Exit(1)
+
+
+class SeedsDisplay:
+    """A bar over the runs of several seeds on a terminal, elsewhere nothing; use it as a context manager."""
+
+    def __init__(self, title: str, count: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+        console = Console(stderr=True)
+        self._display = Progress(
+            TextColumn(f"[bold]{title}"),
+            BarColumn(bar_width=30),
+            TaskProgressColumn(),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            transient=True,
+        )
+        self._task = self._display.add_task("starting", total=float(count))
+        self._count = count
+        self._shares: dict[int, float] = {}
+        self._finished = 0
+        self._bad = 0
+
+    def __enter__(self) -> Self:
+        self._display.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._display.stop()
+
+    def tell(self, seed: int, share: float, what: str) -> None:
+        """Show what a run does now, and what share of it is done."""
+        self._shares[seed] = share
+        self._update(f"seed {seed}, {what}")
+
+    def done(self, outcome: Outcome) -> None:
+        """Count a run that is over."""
+        self._shares[outcome.seed] = 1.0
+        self._finished += 1
+        self._bad += not outcome.passed
+        self._update(f"seed {outcome.seed}, done")
+
+    def _update(self, what: str) -> None:
+        counts = f"{self._finished} of {self._count} done, {self._bad} bad; " if self._count > 1 else ""
+        self._display.update(self._task, completed=sum(self._shares.values()), description=counts + what)
+
+
+def summary(name: str, outcomes: Sequence[Outcome]) -> RenderableType:
+    """Every bar over all seeds, how many seeds pass, and what became of those without result."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    from deploy.experiment import ExperimentResult, FailedRun, summarize
+
+    count, passed = len(outcomes), sum(outcome.passed for outcome in outcomes)
+    robots = [f" on {outcome.robot}" for outcome in outcomes if isinstance(outcome, ExperimentResult)]
+    table = Table(title=f"{name}{robots[0] if robots else ''}, {count} seeds", title_justify="left")
+    for header in ("bar", "limit", "passes", "median", "worst", "seed"):
+        table.add_column(header, justify="left" if header == "bar" else "right", no_wrap=True)
+    for bar in summarize(outcomes):
+        limit = f"{'≥' if bar.at_least else '≤'} {bar.limit:.4g}"
+        passes = f"[{'green' if bar.holds_count == count else 'red'}]{bar.holds_count}/{count}"
+        table.add_row(bar.name, limit, passes, f"{bar.median:.4g}", f"{bar.worst:.4g}", str(bar.worst_seed))
+    lines = [Text(f"seed {run.seed}: {run.error}", "red") for run in outcomes if isinstance(run, FailedRun)]
+    verdict = Text(f"{passed} of {count} seeds pass", "green" if passed == count else "red")
+    return Group(*([table] if robots else []), *lines, verdict)
+
+
+def show(what: RenderableType) -> None:
+    """Print on stdout; wide enough for a table where it is not a terminal."""
+    import sys
+
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else FILE_WIDTH).print(what)
+
+
+def write_outcome(outcome: Outcome, directory: Path | None) -> None:
+    """Write metrics.json of one seed."""
+    if directory is not None:
+        opt.write_json(outcome.as_json(), directory / "metrics.json")

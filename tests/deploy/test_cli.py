@@ -15,7 +15,8 @@ from schemas.load import Run
 from schemas.service import session_identity
 
 COMMANDS = (
-    "up", "plant", "hal", "controller", "record", "stop", "doctor", "replay", "report", "experiment", "bus",
+    "up", "plant", "hal", "controller", "record", "stop", "doctor", "replay", "report", "experiment",
+    "sweep", "bus",
 )  # fmt: skip
 
 
@@ -67,6 +68,10 @@ def test_help_names_all_commands_and_loads_no_heavy_library(capsys: pytest.Captu
         (["report", "nosuch.mcap"], 2, "nosuch.mcap"),
         (["replay", "nosuch.mcap"], 2, "nosuch.mcap"),
         (["experiment", "nosuch"], 2, "nosuch"),
+        (["sweep", "nosuch"], 2, "transition"),
+        (["sweep", "transition", "--jobs", "0"], 2, "--jobs"),
+        (["sweep", "transition", "--seeds", "0"], 2, "--seeds"),
+        (["sweep", "transition", "--set", "seed"], 2, "PATH=VALUE"),
         (["hal", "--scenario", "arm9-transition", "--peers", "hal,ghost"], 2, "ghost"),
         (["nosuch"], 2, "nosuch"),
     ],

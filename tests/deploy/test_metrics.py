@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,11 @@ def truth(mode: list[int], substeps: list[list[float]], position: list[float]) -
         mode=np.array(mode)[:, None],
         motor_torque_substeps=np.array(substeps)[:, :, None],
         hand=np.zeros((k, 3)),
+        hand_orientation=np.tile([1.0, 0.0, 0.0, 0.0], (k, 1)),
+        frames={},
+        world_forces={},
+        contacts=((),) * k,
+        kinetic_energy=np.zeros(k),
     )
 
 
@@ -29,9 +36,15 @@ def trace(phase: list[str], torque_mode: list[bool], desired: list[list[float]])
         torque_mode=np.array(torque_mode),
         torque_reference=empty,
         torque_integral=empty,
+        torque_windup=empty,
+        torque_limited=empty,
+        windup_bound=empty,
+        null_space_share=np.zeros(k),
+        admittance=np.zeros(k, np.bool_),
         torque_commanded=empty,
         position_reference=empty,
         hand_desired=np.array(desired),
+        orientation_desired=np.tile([1.0, 0.0, 0.0, 0.0], (k, 1)),
     )
 
 
@@ -63,14 +76,7 @@ def test_tracking_counts_torque_mode_phases_whose_path_moves() -> None:
 def test_tracking_pairs_by_sequence_and_passes_over_gaps() -> None:
     desired = trace(["track"] * 3, [True] * 3, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     true = truth([10] * 3, [[0.0]] * 3, [0.0] * 3)
-    later = TruthSeries(
-        sequence=np.array([2, 3, 4]),
-        time_s=true.time_s,
-        position=true.position,
-        mode=true.mode,
-        motor_torque_substeps=true.motor_torque_substeps,
-        hand=true.hand,
-    )
+    later = replace(true, sequence=np.array([2, 3, 4]))
     assert tracking_error(desired, later) == pytest.approx([2.0])
 
 

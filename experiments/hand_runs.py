@@ -1,0 +1,147 @@
+"""What the experiments with the arm's hand share: runs, the error of the hand, oscillation, the force of stiction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+from controller_service.model import RobotModel
+from deploy.errors import UsageError
+from deploy.experiment import ExperimentRequest
+from deploy.runner import run_to_log
+from deploy.series import Array, RunSeries, read_series
+from plant_service.model import build, initial_position
+from schemas.load import Run, load_run
+
+Mask = NDArray[np.bool_]
+
+WINDOW_S: Final = 2.0
+"""After a release: what counts as its oscillation."""
+BACK_SHARE: Final = 0.1
+END_S: Final = 0.1
+"""Last stretch of the window, whose mean is where a motion came to rest."""
+
+
+def load(request: ExperimentRequest, scenario: str, own: tuple[str, ...] = ()) -> Run:
+    """Read the experiment's scenario with the request's seed and overrides.
+
+    Raises:
+        UsageError: an override of what the experiment sets itself (`own`, and the seed).
+
+    """
+    for path in request.overrides:
+        if path.startswith(("seed", *own)):
+            raise UsageError(f"--set {path}: the experiment sets it itself; --seed chooses the seed")
+    return load_run(scenario, {**request.overrides, "seed": request.seed})
+
+
+def perform(request: ExperimentRequest, scenario: str, directory: Path, overrides: dict[str, Any]) -> RunSeries:
+    """Run a variant of the scenario and read its log.
+
+    Raises:
+        RunStoppedError: the HAL stopped the robot.
+
+    """
+    run = load_run(scenario, {**request.overrides, **overrides, "seed": request.seed})
+    return read_series(run_to_log(run, directory, processes=request.processes))
+
+
+@contextmanager
+def workplace(request: ExperimentRequest) -> Iterator[Path]:
+    """Give the request's directory, or one that vanishes."""
+    if request.directory is not None:
+        yield request.directory
+        return
+    with TemporaryDirectory(prefix="cosim-experiment-") as scratch:
+        yield Path(scratch)
+
+
+def common_ticks(series: RunSeries) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Give indices of trace and truth for the sequences that both have."""
+    _, of_trace, of_truth = np.intersect1d(series.trace.sequence, series.truth.sequence, return_indices=True)
+    return of_trace, of_truth
+
+
+def hand_error(series: RunSeries) -> tuple[Array, Array]:
+    """Give times (K,) [s] and true less desired hand (K, 3) [m] at the same SYNC, in torque mode with a hand task."""
+    of_trace, of_truth = common_ticks(series)
+    error = series.truth.hand[of_truth] - series.trace.hand_desired[of_trace]
+    chosen = series.trace.torque_mode[of_trace] & np.isfinite(error).all(axis=1)
+    return series.trace.time_s[of_trace][chosen], error[chosen]
+
+
+def oscillation(time_s: Array, signal: Array, release_s: float) -> Array:
+    """Peak to peak (m,) of a signal (K, m) in the `WINDOW_S` after a release, from when it first passes its rest.
+
+    The way back to where the signal comes to rest is no oscillation; what swings beyond it is. 0: it never does.
+    """
+    _, away = _after_release(time_s, signal, release_s)
+    passed = np.logical_or.accumulate(np.sign(away) != np.sign(away[0]), axis=0)
+    swing = np.where(passed, away, 0.0)
+    return np.asarray(swing.max(axis=0) - swing.min(axis=0), np.float64)
+
+
+def return_time(time_s: Array, path: Array, release_s: float) -> float:
+    """Time [s] at which a point's path (K, 3) is first back within `BACK_SHARE` of its way to rest after a release."""
+    times, away = _after_release(time_s, path, release_s)
+    along = away.dot(away[0])
+    return float(times[np.flatnonzero(along <= BACK_SHARE * along[0])[0]])
+
+
+def _after_release(time_s: Array, signal: Array, release_s: float) -> tuple[Array, Array]:
+    """Give times (L,) of the window after a release, and how far the signal (L, m) then is from its rest."""
+    window = (time_s >= release_s) & (time_s < release_s + WINDOW_S)
+    rest = signal[(time_s >= release_s + WINDOW_S - END_S) & (time_s < release_s + WINDOW_S)].mean(axis=0)
+    return time_s[window], np.asarray(signal[window] - rest, np.float64)
+
+
+def settling_time(time_s: Array, distance: Array, release_s: float, band: float) -> float:
+    """Time [s] from a release until a distance (K,) stays below a band; NaN if it never does."""
+    after = time_s >= release_s
+    outside = np.flatnonzero(distance[after] > band)
+    if not outside.size:
+        return 0.0
+    if outside[-1] == np.count_nonzero(after) - 1:
+        return float("nan")
+    return float(time_s[after][outside[-1] + 1] - release_s)
+
+
+def rest_position(series: RunSeries, time_s: float) -> tuple[int, float]:
+    """Index in the truth of the last cycle at or before a time, and its time [s]."""
+    index = int(np.searchsorted(series.truth.time_s, time_s, side="right")) - 1
+    return index, float(series.truth.time_s[index])
+
+
+def stiction_force(run: Run, link: str, direction_in_world: tuple[float, float, float]) -> float:
+    """Least force [N] at a link's origin that breaks the true stiction without moving the hand, at the start posture.
+
+    A motion q̇ of the hand's null space that moves the point at 1 m/s along the direction d starts when F exceeds its
+    friction power Σ b_i |q̇_i|, b the breakaway torques of this run's plant; the easiest one is a linear program:
+    min bᵀ|q̇| subject to J_hand q̇ = 0 and dᵀ J_link q̇ = 1.
+    """
+    robot, plant = run.robot, run.scenario.plant
+    hand = robot.description.hand_frame
+    if hand is None:
+        raise UsageError(f"robot {robot.description.name} has no hand_frame, which the experiment moves")
+    factors = build(robot, plant, run.scenario.seed).friction_factors
+    gears = np.array([joint.gear_ratio for joint in robot.description.joints])
+    breakaway = plant.friction.breakaway * gears * factors
+    model = RobotModel(robot, (hand, link))
+    n = model.n
+    now = model.configure(initial_position(robot, plant), np.zeros(n))
+    direction = np.array(direction_in_world) / np.linalg.norm(direction_in_world)
+    along = direction.dot(now.frames[link].jacobian[:3])
+    rows = np.vstack((now.frames[hand].jacobian, along))
+    found = linprog(
+        np.tile(breakaway, 2), A_eq=np.hstack((rows, -rows)), b_eq=np.append(np.zeros(6), 1.0), bounds=(0, None)
+    )
+    if not found.success:
+        raise UsageError(f"link {link} cannot move along {direction_in_world} while the hand stays: choose another")
+    return float(found.fun)
