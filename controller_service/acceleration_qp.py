@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import lapack
@@ -74,7 +74,7 @@ class AccelerationQp:
         self._size = self._n + (0 if wrench is None else 6)
         self._rows = 2 * self._n + pairs + (self._size - self._n)
         self._solver = self._make_solver(self._size, self._rows)
-        self._relaxing: Solver | None = None
+        self._relaxing = self._make_solver(self._size + self._soft, self._rows)
 
     def solve(
         self, now: Configuration, tasks: Sequence[Task], added: Array, sequence: int, driving: Array | None = None
@@ -152,8 +152,6 @@ class AccelerationQp:
     ) -> ReferenceMotion:
         """Solve again over [x; σ] with l ≤ A x + σ ≤ u in the soft rows."""
         size, soft = self._size, self._soft
-        if self._relaxing is None:
-            self._relaxing = self._make_solver(size + soft, self._rows)
         whole, linear = np.zeros((size + soft, size + soft)), np.zeros(size + soft)
         whole[:size, :size], linear[:size] = P, q
         whole.flat[size * (size + soft + 1) :: size + soft + 1] = PENALTY * float(P.diagonal().max())
@@ -163,6 +161,7 @@ class AccelerationQp:
         solution = self._relaxing.solve(whole, linear, A, rows.lower, rows.upper)
         if not solution.solved:
             raise QpError(solution.status, solution.primal_residual, solution.dual_residual, sequence)
+        solution = replace(solution, iterations=first.iterations + solution.iterations)
         labels = [f"range or speed of {name}" for name in self.limits.names] + [
             f"distance {a} to {b}" for a, b in pairs
         ]

@@ -79,8 +79,6 @@ class CollisionModel:
     """
 
     def __init__(self, robot: Robot, config: CollisionAvoidance, model: RobotModel, response_s: float) -> None:
-        self.max_pairs = config.max_pairs
-        """Number of rows."""
         self.braking = config.damping**2 / (config.influence_m - config.safe_m)
         """a [m/s²]: the largest deceleration that v(d) asks for."""
         self._config, self._response = config, response_s
@@ -94,6 +92,8 @@ class CollisionModel:
         both = [(self._shapes[first], self._shapes[second]) for first, second in self._pairs]
         self.pairs = tuple((first.name, second.name) for first, second in both)
         """All pairs that are kept apart."""
+        self.max_pairs = config.max_pairs or len(self.pairs)
+        """Number of rows."""
         geometry = pin.GeometryModel()
         for shape in self._shapes:
             capsule = pin.coal.Capsule(shape.radius, 2.0 * shape.half)

@@ -23,6 +23,7 @@ from controller_service.task_set import TaskSet
 from controller_service.tick import EventLog, HandTrace, Tick, make_trace
 from controller_service.torque_mode import TorqueMode, TorqueTick
 from schemas.base import ControlMode, Vector
+from schemas.errors import ConfigurationError
 from schemas.load import Run
 from schemas.messages import ControllerTrace, Event, HalStatus, JointCommand, RobotState
 
@@ -35,7 +36,9 @@ CLIP_SHARE = 1e-3
 STOP_S = 0.1
 """Time from the failure of torque mode to the controller's end."""
 STOP_DECAY_S = 0.025
-"""Time constant with which the last torque goes over into gravity's meanwhile."""
+"""Time constant with which the last torque goes over into a braking one meanwhile."""
+STOP_DAMPING = 10.0
+"""[1/s] of that braking: with the joints' inertia it stops them in some 100 ms where the torque limits allow it."""
 
 
 class Stage(Enum):
@@ -65,7 +68,8 @@ class Controller:
     to hold (docs/architecture.md).
 
     When torque mode cannot go on (a QP without solution, a contact that is to stop the robot) the last torque goes over
-    into gravity's within `STOP_S` while an event tells why; then the error is raised, and the HAL holds the robot.
+    into one that carries and brakes the robot while an event tells why; after `STOP_S` the error is raised, and the HAL
+    holds the robot.
 
     Args:
         run: robot and scenario.
@@ -94,6 +98,11 @@ class Controller:
             collision = CollisionModel(run.robot, config.collision, self._model, limits.response_s)
         self._qp = AccelerationQp(limits, config.qp, collision, None if hand is None else hand.variables)
         self._tasks = TaskSet(self._frame, config)
+        if config.null_space is not None and self._tasks.hand_rows >= self._n:
+            raise ConfigurationError(
+                f"controller.null_space: a hand task of {self._tasks.hand_rows} directions leaves {self._n} joints no"
+                " null space; leave it out, or choose another controller.hand_task"
+            )
         self._torque_mode = TorqueMode(run, self._qp, self._references, self._tasks, hand)
         contacts = config.observer is not None and config.observer.reaction != "none"
         self._log = EventLog(description.joint_names, contacts=contacts)
@@ -150,6 +159,9 @@ class Controller:
             tick = self._drive(state, time, estimate, elapsed_s, before)
         self._acceleration = tick.motion.acceleration
         self._log.note(state, tick)
+        if (phase := self._references.take_dropped_path()) is not None:
+            text = f"{phase}: too little time is left for its path; the hand holds"
+            self._log.tell(state, "path_dropped", text, "warning")
         return self._command(state, tick), make_trace(state, time, estimate, tick, self._hand_trace(estimate, tick))
 
     def _accept(self, state: RobotState) -> tuple[Array, int]:
@@ -230,16 +242,21 @@ class Controller:
             terms = self._torque_mode.start(now, time, state, given)
             self._torques.clear()
             self._warn_of_friction(state, now)
-            return self._torque_tick(now, estimate, terms)
+            return self._torque_tick(now, estimate, terms, state)
         try:
             terms = self._torque_mode.step(now, time, state, self._acceleration, elapsed_s)
+            return self._torque_tick(now, estimate, terms, state)
         except ControllerError as error:
             self._fail(state, error)
             return self._stop(now, estimate, elapsed_s)
-        return self._torque_tick(now, estimate, terms)
 
-    def _torque_tick(self, now: Configuration, estimate: Estimate, terms: TorqueTick) -> Tick:
+    def _torque_tick(self, now: Configuration, estimate: Estimate, terms: TorqueTick, state: RobotState) -> Tick:
         limits, torque, motion = self._qp.limits.torque, terms.torque, terms.motion
+        if not all(map(math.isfinite, torque.tolist())):
+            worst = int(np.argmin(np.isfinite(torque)))
+            raise ControllerError(
+                f"state {state.sequence}: the law's torque of {self._model.names[worst]} is {torque[worst]}"
+            )
         self._torque = np.minimum(np.maximum(torque, -limits), limits)
         if np.count_nonzero(np.abs(torque) > self._reported_torque):
             status = f"{motion.solution.status}, torque clipped"
@@ -258,14 +275,16 @@ class Controller:
         self._log.tell(state, "torque_mode_failed", f"{error} The robot is brought to rest.", "error")
 
     def _stop(self, now: Configuration, estimate: Estimate, elapsed_s: float) -> Tick:
-        """τ ← g + (τ − g) e^(−t/`STOP_DECAY_S`): friction and the drives' hold do the rest."""
+        """τ ← τ_b + (τ − τ_b) e^(−t/`STOP_DECAY_S`) with τ_b = g − `STOP_DAMPING` diag(M) q̇."""
         assert self._failure is not None
         error, since_s = self._failure
         if since_s >= STOP_S:
             raise error
         self._failure = (error, since_s + elapsed_s)
-        gravity = now.gravity
-        self._torque = gravity + math.exp(-elapsed_s / STOP_DECAY_S) * (self._torque - gravity)
+        braking = now.gravity - STOP_DAMPING * now.mass.diagonal() * now.velocity
+        torque = braking + math.exp(-elapsed_s / STOP_DECAY_S) * (self._torque - braking)
+        limits = self._qp.limits.torque
+        self._torque = np.minimum(np.maximum(torque, -limits), limits)
         reference = self._torque_mode.law.velocity_reference
         motion = self._unsolved("stopping")
         return Tick(ControlMode.TORQUE, now, motion, reference, estimate.position, None, self._torque, None)

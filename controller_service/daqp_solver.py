@@ -58,6 +58,6 @@ class DaqpSolver:
         dual = np.asarray(info["lam"]) / scale
         errors = residuals(P, q, A, lower, upper, x, dual)
         status = EXIT.get(flag, f"exit flag {flag}")
-        if status == SOLVED and max(errors) > self._tolerance:
+        if status == SOLVED and not all(error <= self._tolerance for error in errors):  # a NaN is not
             status = "inaccurate"
         return QpSolution(np.asarray(x), dual, int(info["iterations"]), status, *errors)

@@ -121,7 +121,8 @@ class WrenchVariables:
     """The wrench F^r as six more variables of the QP, and step (a)'s task on them.
 
     x = [q̈; F^r] (n + 6,). With ρ^r = F^r itself in place of the coefficients of friction cones, W_l is the identity:
-    ½ w ‖F^r − F^d‖², bounded by lower ≤ F^r ≤ upper. The torque that F^r saves or costs couples it to q̈: (2) gives
+    ½ w ‖F^r − F^d‖², each component between 0 and F^d: a wrench that nobody asked for would let the QP count on help
+    from outside where a torque limit binds. The torque that F^r saves or costs couples it to q̈: (2) gives
     u = M q̈ + h − Jᵀ F^r, so that F^r is what is left of F^d where a torque limit does not allow more.
 
     Motion tasks are added to the blocks P[:n, :n] and q[:n] of the program.
@@ -149,7 +150,6 @@ class WrenchVariables:
 
         """
         desired = np.array(config.force_in_world + config.torque_in_world)
-        upper = np.repeat([config.force_limit, config.torque_limit], 3)
         for what, limit, values in (
             ("force", config.force_limit, config.force_in_world),
             ("torque", config.torque_limit, config.torque_in_world),
@@ -160,7 +160,7 @@ class WrenchVariables:
                     f"controller.hand_force.wrench_task: a component of {what}_in_world is {largest:g}, beyond"
                     f" {what}_limit {limit:g}; ask for less or raise the limit"
                 )
-        return cls(frame, n, config.weight, desired, -upper, upper)
+        return cls(frame, n, config.weight, desired, np.minimum(desired, 0.0), np.maximum(desired, 0.0))
 
     def add_to(self, P: Array, q: Array) -> None:
         """Add w I to the lower right block of P (n + 6, n + 6) and −w F^d to the end of q (n + 6,), in place."""

@@ -19,13 +19,21 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lapack
 
 from controller_service.anti_windup import AntiWindupLimit
+from controller_service.errors import ControllerError
 from controller_service.model import Array, Configuration
 from controller_service.null_space import TaskInverse, TaskJacobian, invert, smallest_singular_value
 from schemas.control_law import Leak, NullSpace
 from schemas.controller import ControllerConfig
 
+CALM_S = 0.5
+"""Time constant of the slow state's mean that a robot which gives way returns to."""
+RETURN_S = 0.1
+"""Time constant of that return."""
+RETURN_FACTOR = 1.2
+"""Of the smallest singular value: from where J⁺ is trusted again."""
 PURE = Leak(slow_rate=0.0, fast_rate=0.0, fast_share=0.0)
 """A pure integrator: s̃ = s."""
 
@@ -114,7 +122,8 @@ class IntegralLaw:
 
     **Null space**: with a task and its share σ from 0 to 1 (`NullSpace.fade_s` apart) the law is (1 − σ)·(3) + σ·(21),
     with a^θ = s^θ − J⁺e^θ for both rates, and (26) for the gain: u_K = (1 − μ) JᵀJ⁺ᵀ K J⁺J a^θs + μ K a^θf. The slow
-    memory then acts in the task alone; the null space keeps friction, damping and the fast part.
+    memory then acts in the task alone; the null space keeps friction, damping and the fast part. With a leak the slow
+    state's null-space part is forgotten at the fast rate.
 
     **Anti-windup**: u_K is limited (`AntiWindupLimit`). In (11) the place of s is taken by the velocity error whose V
     is to fall: s̃ with (14), ã = (1 − σ) s̃ + σ (μ a^θf + (1 − μ) a^θs) with (26), as V̇ = −ãᵀũ_K without leak. (26) has
@@ -137,12 +146,16 @@ class IntegralLaw:
         self._enabled = config.integral == "passivity"
         self._null_space: NullSpace | None = config.null_space
         self._back_calculation = config.anti_windup.back_calculation
+        self._forget_rate = leak.fast_rate
         self._slow, self._fast = LeakyState(n, leak.slow_rate), LeakyState(n, leak.fast_rate)
         self._limit = AntiWindupLimit(torque_limit, config.anti_windup)
         self._jacobian: Array | None = None
         self._fade = 0.0
         self._applied = np.zeros(n)
         """ũ_K of the last tick."""
+        self._calm = np.zeros(n)
+        """Mean of the slow state over the last `CALM_S` or so without contact."""
+        self._resting = False
         self._last = np.zeros(n)
         self.velocity_reference = np.zeros(n)
         """q̇ʳ (n,) [rad/s]."""
@@ -155,11 +168,13 @@ class IntegralLaw:
         zero: Array = np.zeros(len(now.velocity))
         start: Array = zero
         if torque is not None and self._enabled:
-            start = np.asarray(
-                np.linalg.solve(integral_gain(now, self._lambda), torque) / (1.0 - self._share), np.float64
-            )
+            *_, solution, fault = lapack.dgesv(integral_gain(now, self._lambda), torque)
+            if fault != 0:
+                raise ControllerError("the integral gain C + K is singular: change to torque mode at rest")
+            start = solution / (1.0 - self._share)
         self._slow.start(start)
         self._fast.start(zero)
+        self._calm = start
         self._last = start
         self._fade, self._jacobian = 0.0, None
         self.velocity_reference = now.velocity + start
@@ -168,6 +183,17 @@ class IntegralLaw:
     def integrate(self, acceleration: Array, elapsed_s: float) -> None:
         """q̇ʳ ← q̇ʳ + T q̈ʳ (n,), held for `elapsed_s`."""
         self.velocity_reference = self.velocity_reference + elapsed_s * acceleration
+
+    def rest(self, now: Configuration, elapsed_s: float) -> None:
+        """Let q̇ʳ go with the robot, in place of `integrate`, while it gives way to a contact.
+
+        s stays, so that giving way winds nothing up, and the slow state returns to what it was before the contact
+        (`CALM_S` ago on average): that carries errors of masses and torque constants, but does not push back.
+        """
+        self.velocity_reference = now.velocity + self._last
+        share = 1.0 - math.exp(-elapsed_s / RETURN_S)
+        self._slow.error = self._slow.error + share * (self._calm - self._slow.error)
+        self._resting = True
 
     def terms(self, now: Configuration, task: TaskJacobian | None, elapsed_s: float) -> LawTerms:
         """Take up the velocity error of a tick, `elapsed_s` after the last one (0 at the first)."""
@@ -181,6 +207,9 @@ class IntegralLaw:
         for state in (self._slow, self._fast):
             state.advance(error - self._last, change, elapsed_s)
         self._last = error
+        if not self._resting:
+            self._calm = self._calm + (1.0 - math.exp(-elapsed_s / CALM_S)) * (self._slow.error - self._calm)
+        self._resting = False
         self._limit.advance(elapsed_s)
         gain = self._lambda * now.mass.diagonal()
         if inverse is None:
@@ -200,7 +229,8 @@ class IntegralLaw:
         if config is None:
             return None
         inverse = None
-        if task is not None and smallest_singular_value(task.jacobian) > config.smallest_singular_value:
+        bound = config.smallest_singular_value * (1.0 if self._fade > 0.0 else RETURN_FACTOR)
+        if task is not None and smallest_singular_value(task.jacobian) > bound:
             inverse = invert(now, task, config.inverse)
         if inverse is None:
             if self._fade > 0.0:
@@ -214,7 +244,19 @@ class IntegralLaw:
             m = len(inverse.task.jacobian)
             self._slow.drift, self._fast.drift, self._jacobian = np.zeros(m), np.zeros(m), None
         self._fade = min(1.0, self._fade + elapsed_s / config.fade_s)
+        self._forget_null_space(inverse, elapsed_s)
         return inverse
+
+    def _forget_null_space(self, inverse: TaskInverse, elapsed_s: float) -> None:
+        """Let the slow state's null-space part (I − J⁺J) s^θs go at the fast rate, times σ.
+
+        (26) keeps it out of u_K, where neither limit nor back-calculation sees it, but the inertial terms have it. It
+        is no part of J s^θs, so the task's memory stays as it is.
+        """
+        kept = math.exp(-self._fade * self._forget_rate * elapsed_s)
+        if kept < 1.0:
+            slow = self._slow.error
+            self._slow.error = slow - (1.0 - kept) * (slow - inverse.inverse.dot(inverse.task.jacobian.dot(slow)))
 
     def _compliant(self, now: Configuration, inverse: TaskInverse, gain: Array) -> tuple[Array, Array, Array]:
         """Inertial terms, u_K and ã of (1 − σ)·(3) + σ·(21) with (26)."""

@@ -82,7 +82,8 @@ class OsqpSolver:
         reached = A.dot(minimiser)
         if np.logical_and.reduce((lower <= reached) & (reached <= upper)):
             self._last, self._dual = minimiser, np.zeros(len(lower))
-            error = stationarity(P.dot(minimiser) + q, q)
+            Px = P.dot(minimiser)
+            error = stationarity(Px + q, Px, q)
             if error <= self._tolerance:
                 return QpSolution(minimiser, self._dual, 0, SOLVED, 0.0, error)
         length = np.sqrt(np.einsum("ij,ij->i", A, A))
@@ -117,7 +118,7 @@ class OsqpSolver:
             if dual.any() and "infeasible" not in status:
                 x, dual = _polish(q, A, lower, upper, factor, x, dual, scaled * length, length)
             errors = residuals(P, q, A, lower, upper, x, dual)
-            if max(errors) <= self._tolerance:
+            if all(error <= self._tolerance for error in errors):  # a NaN is not
                 status = SOLVED
             elif status == SOLVED:
                 status = "inaccurate"

@@ -49,24 +49,26 @@ def residuals(P: Array, q: Array, A: Array, lower: Array, upper: Array, x: Array
     """Relative KKT residuals, both 0 at the optimum.
 
     primal: largest violation of l ≤ A x ≤ u, over 1 + |A x| of the row.
-    dual: largest of |P x + q + Aᵀ y| over its terms' scale 1 + max |q|, and of the products y⁺ (u − A x), y⁻ (A x − l)
-    (complementarity), over 1 + |q|·|x|.
+    dual: largest of |P x + q + Aᵀ y| over its terms' scale 1 + max(|q|, |P x|), and of the products y⁺ (u − A x),
+    y⁻ (A x − l) (complementarity), over 1 + (|q| + |P x|)·|x|.
     """
     Ax = A.dot(x)
     excess = np.maximum(lower - Ax, Ax - upper)
     primal = float((np.maximum(excess, 0.0) / (1.0 + np.abs(Ax))).max()) if excess.max() > 0.0 else 0.0
+    Px = P.dot(x)
     if not dual.any():
-        return primal, stationarity(P.dot(x) + q, q)
-    stationary = stationarity(P.dot(x) + q + dual.dot(A), q)
+        return primal, stationarity(Px + q, Px, q)
+    stationary = stationarity(Px + q + dual.dot(A), Px, q)
     active = dual != 0.0
     bound = np.where(dual > 0.0, upper, lower)[active]
-    products = np.abs(dual[active] * (bound - Ax[active])).max() / (1.0 + np.abs(q) @ np.abs(x))
+    products = np.abs(dual[active] * (bound - Ax[active])).max() / (1.0 + (np.abs(q) + np.abs(Px)) @ np.abs(x))
     return primal, max(stationary, float(products))
 
 
-def stationarity(gradient: Array, q: Array) -> float:
-    """Return the largest |∇ₓL| (n,) over its terms' scale 1 + max |q|."""
-    return float(np.maximum.reduce(np.abs(gradient)) / (1.0 + np.maximum.reduce(np.abs(q))))
+def stationarity(gradient: Array, Px: Array, q: Array) -> float:
+    """Return the largest |∇ₓL| (n,) over its terms' scale 1 + max(|q|, |P x|)."""
+    scale = max(np.maximum.reduce(np.abs(q)), np.maximum.reduce(np.abs(Px)))
+    return float(np.maximum.reduce(np.abs(gradient)) / (1.0 + scale))
 
 
 def objective(tasks: Sequence[Task], n: int, regularization: float) -> tuple[Array, Array]:

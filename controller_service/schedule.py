@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,6 +78,15 @@ class Targets:
     hand: PoseTarget | None
     """None while the hand task does not run."""
 
+    def at_rest(self) -> Targets:
+        """Give the same places without velocity and acceleration."""
+        posture, hand = self.posture, self.hand
+        still = np.zeros_like(posture.position)
+        return Targets(
+            replace(posture, velocity=still, acceleration=still),
+            None if hand is None else replace(hand, velocity=np.zeros(6), acceleration=np.zeros(6)),
+        )
+
 
 class References:
     """Desired posture and hand pose, kept without a jump from phase to phase.
@@ -95,6 +104,7 @@ class References:
         """When, after the origin, the entered phase is over and its motions have ended."""
         self._posture: PostureMotion | None = None
         self._hand: HandMotion | None = None
+        self._dropped_path: str | None = None
         self.posture_target: PostureTarget | None = None
         self.hand_target: PoseTarget | None = None
         """None while the hand task does not run."""
@@ -104,6 +114,11 @@ class References:
         self._index = -1
         self.posture_target = None
         self.hand_target = None
+
+    def take_dropped_path(self) -> str | None:
+        """Name the phase whose path was left out, for want of time after a hold or a contact; once."""
+        dropped, self._dropped_path = self._dropped_path, None
+        return dropped
 
     def advance(self, time: PhaseTime, now: Configuration) -> Targets:
         """Give the targets of a tick at a configuration."""
@@ -144,7 +159,7 @@ class References:
         if self._frame is not None and (phase.hand_path is not None or not phase.posture):
             path = phase.hand_path
             if path is not None and path.lap_s * path.laps > time.left_s * (1.0 + 1e-9):
-                path = None
+                self._dropped_path, path = time.phase.name, None
             frame = now.frames[self._frame]
             pose = (frame.position, frame.rotation) if before is None else (before.position, before.rotation)
             self._hand = hand_motion(*pose, path)

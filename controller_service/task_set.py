@@ -28,7 +28,15 @@ class TaskSet:
         self._gains = config.posture, config.hand
         self._soft = _without_stiffness(config.posture), _without_stiffness(config.hand)
         force = config.hand_force
-        self._hybrid = None if force is None else HybridGains.of(config.hand, force.admittance)
+        self._hybrid, self._soft_hybrid = (
+            None if force is None else HybridGains.of(gains, force.admittance)
+            for gains in (config.hand, _without_stiffness(config.hand))
+        )
+
+    @property
+    def hand_rows(self) -> int:
+        """Directions that the hand task asks for."""
+        return len(range(6)[self._hand_task.rows])
 
     def make(
         self, now: Configuration, targets: Targets, *, yielding: bool = False, forces: HandForces | None = None
@@ -38,19 +46,20 @@ class TaskSet:
         Args:
             now: configuration.
             targets: of the posture, and of the hand where it has a task.
-            yielding: all tasks keep their damping alone.
+            yielding: all tasks keep their damping alone, against any motion.
             forces: what the hand feels and is to give way to.
 
         """
         posture_gains, hand_gains = self._soft if yielding else self._gains
+        hybrid = self._soft_hybrid if yielding else self._hybrid
+        if yielding:
+            targets = targets.at_rest()
         posture = self._posture_task(now, targets.posture, posture_gains)
         if self._frame is None or targets.hand is None:
             return (posture,)
-        if forces is not None and forces.compliance.active and self._hybrid is not None:
+        if forces is not None and forces.compliance.active and hybrid is not None:
             rows, hand = self._hand_task.rows, targets.hand
-            return posture, HybridPoseTask(
-                now, self._frame, hand, self._hybrid, forces.reference, forces.measured, rows
-            )
+            return posture, HybridPoseTask(now, self._frame, hand, hybrid, forces.reference, forces.measured, rows)
         return posture, self._hand_task(now, self._frame, targets.hand, hand_gains)
 
     def jacobian(self, now: Configuration, targets: Targets) -> TaskJacobian | None:

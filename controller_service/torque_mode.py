@@ -30,6 +30,8 @@ class Sensed:
     """Estimated (n,) [N·m], as Jᵀ F of the environment."""
     contact: ContactState | None
     hand: HandForces | None
+    yields: bool = False
+    """The robot gives way to a contact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +120,10 @@ class TorqueMode:
         """
         sensed = self._sense(now, state, elapsed_s)
         targets, tasks = self._refer(now, time, sensed)
-        self.law.integrate(acceleration, elapsed_s)
+        if sensed.yields:
+            self.law.rest(now, elapsed_s)
+        else:
+            self.law.integrate(acceleration, elapsed_s)
         law = self.law.terms(now, self._tasks.jacobian(now, targets), elapsed_s)
         friction = self._compensate(now)
         motion = self._qp.solve(now, tasks, law.integral + friction, state.sequence, law.limited)
@@ -160,19 +165,17 @@ class TorqueMode:
                 joint = self._names[contact.joint]
                 raise ContactError(joint, contact.value, self._detector.thresholds[contact.joint], state.sequence)
         hand = None if self._hand is None else self._hand.update(now, state, elapsed_s)
-        return Sensed(external, contact, hand)
+        yields = contact is not None and contact.active and self._reaction == "compliant"
+        return Sensed(external, contact, hand, yields)
 
     def _refer(self, now: Configuration, time: PhaseTime, sensed: Sensed) -> tuple[Targets, tuple[Task, ...]]:
         """Make targets and tasks: the schedule's, changed by what was sensed."""
-        yielding = False
-        if sensed.contact is not None and self._reaction == "compliant":
-            yielding = sensed.contact.active
-            if sensed.contact.ended:
-                self._references.forget()
+        if sensed.contact is not None and sensed.contact.ended and self._reaction == "compliant":
+            self._references.forget()
         if sensed.hand is not None and sensed.hand.led:
             self._references.follow_hand(now, self._led_directions)
         targets = self._references.advance(time, now)
-        return targets, self._tasks.make(now, targets, yielding=yielding, forces=sensed.hand)
+        return targets, self._tasks.make(now, targets, yielding=sensed.yields, forces=sensed.hand)
 
     def _compensate(self, now: Configuration) -> Array:
         return self._zero if self._friction is None else self._friction.torque(now.velocity)

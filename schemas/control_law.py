@@ -48,9 +48,10 @@ class NullSpace(Model):
     """Metric in which the QP's posture task is met beside the hand task. With `inertia` (M) what the hand task adds,
     M (q̈ʳ − q̈^ob), is a pure task torque; with `joint` (I) it loads the null space while the hand is off its place."""
     fade_s: PositiveFloat = 1.0
-    """The law goes over from (3) to (21), and back, in this time."""
-    smallest_singular_value: PositiveFloat = 0.03
-    """Of J (metres and radians): below, J⁺ is not trusted and the law goes back to (3)."""
+    """The law goes over from (3) to (21) in this time; back it goes at once, from the torque that acts."""
+    smallest_singular_value: PositiveFloat = 0.08
+    """Of J (metres and radians): below, J⁺ is not trusted and the law goes back to (3); it returns above 1.2 times
+    this. The derivative terms of (21) grow as its inverse."""
 
 
 class JointFriction(Model):
@@ -92,8 +93,8 @@ class DisturbanceObserver(Model):
     thresholds: dict[str, PositiveFloat] = Field(default_factory=dict)
     """[N·m] a joint."""
     reaction: Literal["none", "event", "compliant", "stop"] = "event"
-    """`event`: tell; `compliant`: tell, and give up the stiffness of all tasks while the contact lasts, then go on from
-    where the robot is; `stop`: tell, and stop safely."""
+    """`event`: tell; `compliant`: tell, and while the contact lasts keep nothing but the damping of all tasks, at rest
+    and with the integral as before the contact, then go on from where the robot is; `stop`: tell, and stop safely."""
     dwell_s: NonNegative = 0.3
     """A contact is over when all joints have been below half their threshold for this time."""
 
@@ -157,6 +158,16 @@ class HandForce(Model):
     dual_compliance: DualCompliance | None = None
     """None: the admittance is always on."""
 
+    @model_validator(mode="after")
+    def _check(self) -> HandForce:
+        turning = self.admittance.directions[3:]
+        if self.dual_compliance is not None and any(turning) and not all(turning):
+            raise ValueError(
+                "admittance.directions: with dual_compliance the hand is led in all three moments or in none, since an"
+                f" orientation is kept or given up as a whole; got {list(turning)}"
+            )
+        return self
+
 
 class WorldCapsule(Model):
     """An obstacle that the controller knows."""
@@ -180,8 +191,8 @@ class CollisionAvoidance(Model):
     """d_s."""
     damping: PositiveFloat = 0.5
     """ξ [m/s]: the speed of approach that is allowed at d_i."""
-    max_pairs: PositiveInt = 8
-    """Rows of the QP; the nearest pairs have them."""
+    max_pairs: PositiveInt | None = None
+    """Rows of the QP; the nearest pairs have them. None: one for each pair, so that none is left out."""
 
     @model_validator(mode="after")
     def _check(self) -> CollisionAvoidance:

@@ -22,6 +22,8 @@ from schemas.scenario import Scenario
 
 M = TypeVar("M", bound=BaseModel)
 
+MAXIMUM_BACK_CALCULATION_PERIOD = 0.5
+"""κT above this is near the border of stability where J⁺ is far from orthogonal."""
 MAXIMUM_LAMBDA_PERIOD = 0.3
 """λT above this leaves no phase margin for the integral loop with a cycle of delay."""
 
@@ -173,6 +175,12 @@ def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> 
             f"{path}: controller.lambda: λT = {product:.3g} with T = {robot.period_s:g} s; expected at most"
             f" {MAXIMUM_LAMBDA_PERIOD} (λ ≤ {MAXIMUM_LAMBDA_PERIOD * robot.rate_hz:g}), or the integral loop"
             " is unstable"
+        )
+    share = scenario.controller.anti_windup.back_calculation * robot.period_s
+    if share > MAXIMUM_BACK_CALCULATION_PERIOD:
+        raise ConfigurationError(
+            f"{path}: controller.anti_windup.back_calculation: κT = {share:.3g} with T = {robot.period_s:g} s; expected"
+            f" at most {MAXIMUM_BACK_CALCULATION_PERIOD}, or the state swings about its limit"
         )
     for part in ("null_space", "hand_force"):
         if getattr(scenario.controller, part) is not None and robot.hand_frame is None:

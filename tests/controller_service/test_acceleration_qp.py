@@ -126,7 +126,7 @@ def test_the_wrench_is_solved_as_by_a_program_written_out(arm: Robot) -> None:
     """½ Σ w‖A q̈ − b‖² + ½ w‖F − F^d‖² + ½ γ‖x‖² on [I 0; M −Jᵀ; 0 I] x, here assembled from the tasks' own A and b."""
     qp, reference = build(arm, "osqp", PUSH), DaqpSolver(15, 24, 1000, 1e-6)
     desired = np.array(PUSH.force_in_world + PUSH.torque_in_world)
-    bound = np.array([PUSH.force_limit] * 3 + [PUSH.torque_limit] * 3)
+    least, most = np.minimum(desired, 0.0), np.maximum(desired, 0.0)
     short = 0
     for now, tasks, added, _ in ticks(arm, 40, 23):
         J = now.frames["hand"].jacobian
@@ -140,8 +140,8 @@ def test_the_wrench_is_solved_as_by_a_program_written_out(arm: Robot) -> None:
         rows = np.block([[np.eye(9), np.zeros((9, 6))], [now.mass, -J.T], [np.zeros((6, 9)), np.eye(6)]])
         low, high = qp.limits.acceleration_bounds(now)
         rest = now.nonlinear + added
-        lower = np.concatenate((low, -qp.limits.torque - rest, -bound))
-        upper = np.concatenate((high, qp.limits.torque - rest, bound))
+        lower = np.concatenate((low, -qp.limits.torque - rest, least))
+        upper = np.concatenate((high, qp.limits.torque - rest, most))
         expected = reference.solve(P, q, rows, lower, upper)
         motion = qp.solve(now, tasks, added, 0)
         assert expected.solved
@@ -261,7 +261,8 @@ def test_a_distance_that_no_torque_can_keep_is_relaxed_and_named(
     assert (np.abs(torque) <= qp.limits.torque * (1 + 1e-5)).all()
     # The hardest braking that torques and joints allow, as a linear program over [q̈; F]
     J, lower, upper = now.frames["hand"].jacobian, *qp.limits.acceleration_bounds(now)
-    force = [(-200.0, 200.0)] * 3 + [(-30.0, 30.0)] * 3 if wrench else [(0.0, 0.0)] * 6
+    desired = wrench.force_in_world + wrench.torque_in_world if wrench else (0.0,) * 6
+    force = [(min(value, 0.0), max(value, 0.0)) for value in desired]
     sides = np.vstack((np.hstack((now.mass, -J.T)), np.hstack((-now.mass, J.T))))
     room = np.concatenate((qp.limits.torque - now.nonlinear, qp.limits.torque + now.nonlinear))
     bounds = [*zip(lower, upper, strict=True), *force]

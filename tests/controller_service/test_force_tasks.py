@@ -241,13 +241,14 @@ def test_torque_limits_are_met_by_wrench_or_motion_as_the_weights_say(resting: C
         moved.append(np.linalg.norm(jacobian[:3] @ solution.x[:9]))
     assert wanted - 1.0 < kept[0] < wanted - 0.1
     assert kept[1] < wanted - 4.0
-    assert moved[1] < 0.02 * moved[0]
+    assert moved[1] < 0.05 * moved[0]
 
 
-def test_the_bounds_hold_each_component(resting: Configuration) -> None:
-    variables = WrenchVariables.of("hand", 9, WrenchTask(force_limit=200.0, torque_limit=30.0))
-    assert np.array_equal(variables.upper, [200, 200, 200, 30, 30, 30])
-    assert np.array_equal(variables.lower, -variables.upper)
+def test_no_component_is_more_than_asked_for_or_of_the_other_sign(resting: Configuration) -> None:
+    config = WrenchTask(force_in_world=(20.0, -30.0, 0.0), torque_in_world=(0.0, 1.0, -2.0))
+    variables = WrenchVariables.of("hand", 9, config)
+    assert np.array_equal(variables.upper, [20, 0, 0, 0, 1, 0])
+    assert np.array_equal(variables.lower, [0, -30, 0, 0, 0, -2])
     assert variables.coupling(resting) == pytest.approx(-resting.frames["hand"].jacobian.T)
 
 

@@ -151,6 +151,7 @@ def test_the_faded_law_is_between_the_two(model: RobotModel, kind: Kind) -> None
     path, leak = along(model, 60), {"slow_rate": 0.3, "fast_rate": 80.0, "fast_share": 0.4}
     laws = [law_of(kind, fade_s, leak=leak) for fade_s in (1e15, 0.3, AT_ONCE)]
     for law in laws:
+        law._forget_rate = 0.0
         feed(law, path, task)
     now = model.configure(path[-1].position, np.linspace(0.4, -0.6, 9))
     none, some, whole = (law.terms(now, task(now), PERIOD) for law in laws)
@@ -164,6 +165,22 @@ def test_the_faded_law_is_between_the_two(model: RobotModel, kind: Kind) -> None
     bare = law_of(kind, leak=leak)
     feed(bare, path, lambda _: None)
     assert np.allclose(bare.terms(now, None, PERIOD).integral, none.integral)
+
+
+def test_the_slow_memory_forgets_the_null_space_and_keeps_the_task(model: RobotModel) -> None:
+    """(I − J⁺J) s^θs falls by e^(−θ_f t) once σ = 1; J s^θs knows of θ_s alone."""
+    leak = {"slow_rate": 0.5, "fast_rate": 40.0, "fast_share": 0.3}
+    law, now = law_of("dynamic", AT_ONCE, leak=leak), model.configure(START, np.zeros(9))
+    found = invert(now, task(now), "dynamic")
+    assert found is not None
+    law.reset(now, np.linspace(20.0, -30.0, 9))
+    before = law._slow.error
+    for _ in range(50):
+        law.terms(now, task(now), PERIOD)
+    J, time = found.task.jacobian, 50 * PERIOD
+    assert np.allclose(J @ law._slow.error, math.exp(-0.5 * time) * (J @ before))
+    null = np.eye(9) - found.inverse @ J
+    assert np.allclose(null @ law._slow.error, math.exp(-40.5 * time) * (null @ before))
 
 
 def test_sigma_grows_evenly_from_no_step_at_all(model: RobotModel) -> None:

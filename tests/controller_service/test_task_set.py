@@ -118,21 +118,23 @@ def test_with_null_space_the_posture_is_met_in_the_metric_of_the_configuration(
 def test_yielding_leaves_the_damping_alone(
     now: Configuration, targets: Targets, null_space: dict[str, Any] | None
 ) -> None:
-    """K_p = 0 in all tasks: no target's position counts, while damping, feed-forward and weights stay."""
+    """K_p = 0 in all tasks and targets at rest: neither place nor path counts, while damping and weights stay."""
     tasks = task_set(null_space=null_space)
     assert targets.hand is not None
     elsewhere = Targets(
-        replace(targets.posture, position=targets.posture.position + 1.0),
+        replace(targets.posture, position=targets.posture.position + 1.0, velocity=np.ones(9)),
         replace(targets.hand, position=targets.hand.position - 1.0, rotation=now.frames["hand"].rotation),
     )
     pairs = zip(tasks.make(now, targets, yielding=True), tasks.make(now, elsewhere, yielding=True), strict=True)
     assert all(same(one.linear(), other.linear()) for one, other in pairs)
     posture, hand = tasks.make(now, targets, yielding=True)
     soft = [TaskGains.model_validate(gains | {"stiffness": 0.0}) for gains in (POSTURE, HAND)]
-    expected = PostureTask(now, targets.posture, soft[0]).linear()[1]
+    still = targets.at_rest()
+    assert still.hand is not None
+    expected = PostureTask(now, still.posture, soft[0]).linear()[1]
     A, b = posture.linear()
     assert np.allclose(np.linalg.solve(A, b), expected)
-    assert same(hand.linear(), PoseTask(now, "hand", targets.hand, soft[1]).linear())
+    assert same(hand.linear(), PoseTask(now, "hand", still.hand, soft[1]).linear())
     assert (posture.weight, hand.weight) == (2.0, 500.0)
     stiff = tasks.make(now, targets)
     assert not any(same(one.linear(), other.linear()) for one, other in zip(stiff, (posture, hand), strict=True))
