@@ -7,14 +7,18 @@ import math
 import pkgutil
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from deploy.errors import UsageError
 from deploy.variation import varied
+from schemas.errors import ConfigurationError, CosimError
 
-Metric = float | int | str | bool | None | list[float] | dict[str, float]
+Metric = float | int | str | bool | None | list[float] | dict[str, float] | dict[str, str]
+
+RESULT_NAMES: Final = ("metrics.json", "sweep.png", "*/to_torque.png", "*/to_position.png")
+"""Results at a run's place beside the figures that are called like their experiment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,8 @@ class ExperimentResult:
     versions: dict[str, str]
     metrics: dict[str, Metric]
     bars: tuple[Bar, ...]
+    overrides: dict[str, Any] = field(default_factory=dict)
+    """What was set otherwise than the scenario has it, by the user and by the variation of the plant; dotted paths."""
 
     @property
     def passed(self) -> bool:
@@ -90,6 +96,7 @@ class ExperimentResult:
             "robot": self.robot,
             "seed": self.seed,
             "versions": self.versions,
+            "overrides": _plain(self.overrides),
             "metrics": _finite(self.metrics),
             "bars": [bar.as_json() for bar in self.bars],
             "passed": self.passed,
@@ -102,6 +109,8 @@ class FailedRun:
 
     seed: int
     error: str
+    overrides: dict[str, Any] = field(default_factory=dict)
+    """As in `ExperimentResult`."""
 
     @property
     def passed(self) -> bool:
@@ -110,7 +119,7 @@ class FailedRun:
 
     def as_json(self) -> dict[str, Any]:
         """Make the entry of the printed JSON object."""
-        return {"seed": self.seed, "error": self.error}
+        return {"seed": self.seed, "error": self.error, "overrides": _plain(self.overrides)}
 
 
 Outcome = ExperimentResult | FailedRun
@@ -165,6 +174,21 @@ def find_experiment(name: str) -> Experiment:
     return run
 
 
+def attempt(run: Experiment, request: ExperimentRequest) -> Outcome:
+    """Run an experiment for one seed; a run that comes to no result is an outcome, too.
+
+    Raises:
+        UsageError: the run refuses its configuration, which other seeds would too.
+
+    """
+    try:
+        return replace(run(request), overrides=request.overrides)
+    except ConfigurationError as error:
+        raise UsageError(str(error)) from error
+    except CosimError as error:
+        return FailedRun(request.seed, str(error), request.overrides)
+
+
 def seed_requests(
     seeds: Sequence[int],
     overrides: dict[str, Any],
@@ -176,19 +200,22 @@ def seed_requests(
 ) -> list[ExperimentRequest]:
     """Prepare a run for every seed, and make its directory: `seed-N` below `directory`, itself unless `apart`.
 
-    With `vary` every seed has a plant of its own, but for the fields that `overrides` sets.
+    With `vary` every seed has a plant of its own, but for the fields that `overrides` sets. Results of earlier runs at
+    these places (`metrics.json`, figures) are deleted, so that none is taken for one of a run that came to no end.
 
     Raises:
-        UsageError: a directory cannot be made.
+        UsageError: a directory cannot be made, or an old result in it not be deleted.
 
     """
     requests = []
+    _delete_results(directory)
     for seed in seeds:
         place = directory / f"seed-{seed}" if apart else directory
         try:
             place.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"--out {place}: cannot be made: {error.strerror}") from error
+        _delete_results(place)
         requests.append(ExperimentRequest(seed, varied(overrides, seed) if vary else overrides, place, processes))
     return requests
 
@@ -225,6 +252,17 @@ def combine(experiment: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
+def _delete_results(place: Path) -> None:
+    """Delete metrics and figures of an earlier run at a place, known by their names: other pictures stay."""
+    figures = [f"{name}.{kind}" for name in _module_names() for kind in ("png", "svg")]
+    for pattern in (*RESULT_NAMES, *figures):
+        for path in place.glob(pattern):
+            try:
+                path.unlink()
+            except OSError as error:
+                raise UsageError(f"--out {path}: an old result, cannot be deleted: {error.strerror}") from error
+
+
 def _module_names() -> list[str]:
     """Names of the modules of `experiments` as experiments would have them."""
     import experiments
@@ -245,3 +283,14 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list):
         return [_finite(inner) for inner in value]
     return value
+
+
+def _plain(value: Any) -> Any:
+    """Put text for what JSON has no form for: dates and sets of YAML, numbers that are not finite."""
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

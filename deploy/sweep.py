@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import Final
 
 from deploy.errors import DeployError, UsageError
-from deploy.experiment import Experiment, ExperimentRequest, FailedRun, Outcome
+from deploy.experiment import Experiment, ExperimentRequest, Outcome, attempt
 from deploy.launcher import LOG_NAME
 from deploy.supervisor import ONE_THREAD
-from schemas.errors import ConfigurationError, CosimError
 
 POLL_S: Final = 0.1
 """How often progress is read."""
@@ -168,12 +167,7 @@ def _end_with(alive: Connection) -> None:
 def _work(run: Experiment, request: ExperimentRequest) -> Outcome:
     tell = partial(_tell, request.seed)
     tell(0.0, "starting")
-    try:
-        return run(replace(request, progress=tell))
-    except ConfigurationError as error:
-        raise UsageError(str(error)) from error
-    except CosimError as error:
-        return FailedRun(request.seed, str(error))
+    return attempt(run, replace(request, progress=tell))
 
 
 def _tell(seed: int, share: float, what: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,38 +18,147 @@ from deploy.experiment import ExperimentRequest
 from deploy.runner import run_to_log
 from deploy.series import Array, RunSeries, read_series
 from plant_service.model import build, initial_position
+from schemas.base import ControlMode
+from schemas.controller import Phase
 from schemas.load import Run, load_run
+from schemas.world import WorldEvent
 
 Mask = NDArray[np.bool_]
 
 WINDOW_S: Final = 2.0
 """After a release: what counts as its oscillation."""
-BACK_SHARE: Final = 0.1
 END_S: Final = 0.1
 """Last stretch of the window, whose mean is where a motion came to rest."""
+TIME_TOLERANCE_S: Final = 1e-6
+"""Sums of times as people write them may differ by this."""
 
 
-def load(request: ExperimentRequest, scenario: str, own: tuple[str, ...] = ()) -> Run:
-    """Read the experiment's scenario with the request's seed and overrides.
+def load(
+    request: ExperimentRequest,
+    scenario: str,
+    own: tuple[str, ...] = (),
+    *,
+    own_whole: tuple[str, ...] = (),
+    events: tuple[str, ...] = (),
+    after_s: float = 0.0,
+) -> Run:
+    """Read the experiment's scenario with the request's seed and overrides, and check what the experiment needs of it.
+
+    Args:
+        request: seed and overrides.
+        scenario: name of the experiment's scenario.
+        own: fields that the experiment sets itself; nothing at, below or above them can be set. The seed is one.
+        own_whole: fields that it sets as a whole, in some of its runs; what lies below them is the user's.
+        events: names of the world's events that it looks at. They begin in torque mode, which stays.
+        after_s: time [s] that is left of the run after the last of these events has let go.
 
     Raises:
-        UsageError: an override of what the experiment sets itself (`own`, and the seed).
+        UsageError: an override of what the experiment sets itself, or something that it needs is missing.
+        ConfigurationError: the overrides do not fit the scenario.
 
     """
+    run = load_run(scenario, {**request.overrides, "seed": request.seed})
     for path in request.overrides:
-        if path.startswith(("seed", *own)):
+        named = _named(path, run)
+        if any(_within(named, field) or _within(field, named) for field in ("seed", *own)) or any(
+            _within(field, named) for field in own_whole
+        ):
             raise UsageError(f"--set {path}: the experiment sets it itself; --seed chooses the seed")
-    return load_run(scenario, {**request.overrides, "seed": request.seed})
+    acting = [event_of(run, name) for name in events]
+    if acting:
+        _check_times(run, acting, after_s)
+    return run
+
+
+def _named(path: str, run: Run) -> str:
+    """Give a path with the name of an event of the world instead of its number."""
+    field = "plant.world.events"
+    number, dot, below = path.removeprefix(f"{field}.").partition(".")
+    events = run.scenario.plant.world.events
+    if not _within(path, field) or not number.isdigit() or int(number) >= len(events):
+        return path
+    return f"{field}.{events[int(number)].name}{dot}{below}"
+
+
+def _within(path: str, field: str) -> bool:
+    """Whether a dotted path is a field or lies below it."""
+    return path == field or path.startswith(f"{field}.")
+
+
+def _check_times(run: Run, events: list[WorldEvent], after_s: float) -> None:
+    scenario = run.scenario
+    last = max(events, key=end_of)
+    needed_s = end_of(last) + after_s
+    if scenario.duration_s < needed_s - TIME_TOLERANCE_S:
+        raise UsageError(
+            f"duration_s {scenario.duration_s:g} s is too short: event {last.name!r} ends at {end_of(last):g} s and the"
+            f" experiment looks at the {after_s:g} s after it; --set duration_s={needed_s:g} or more"
+        )
+    first = min(events, key=lambda event: event.start_s)
+    starts_s = 0.0
+    for index, phase in enumerate(scenario.controller.phases):
+        is_last = index == len(scenario.controller.phases) - 1
+        ends_s = float("inf") if is_last else starts_s + phase.duration_s
+        overlaps = starts_s < needed_s - TIME_TOLERANCE_S and ends_s > first.start_s + TIME_TOLERANCE_S
+        if overlaps and phase.mode is not ControlMode.TORQUE:
+            raise UsageError(
+                f"controller.phases: {phase.name!r} is in mode {phase.mode.value} from {starts_s:g} s on; the"
+                f" experiment needs torque mode from event {first.name!r} at {first.start_s:g} s to {needed_s:g} s"
+            )
+        starts_s = ends_s
+
+
+def end_of(event: WorldEvent) -> float:
+    """Time [s] at which an event's force is gone; a hand's fades after its end."""
+    return event.start_s + event.duration_s + (event.ramp_s if event.kind == "hand_held" else 0.0)
+
+
+def event_of(run: Run, name: str) -> WorldEvent:
+    """Find an event of the world by its name.
+
+    Raises:
+        UsageError: there is none.
+
+    """
+    events = run.scenario.plant.world.events
+    for event in events:
+        if event.name == name:
+            return event
+    raise _missing("plant.world.events", f"event {name!r}", (event.name for event in events))
+
+
+def phase_named(run: Run, name: str) -> Phase:
+    """Find a phase of the controller by its name.
+
+    Raises:
+        UsageError: there is none.
+
+    """
+    phases = run.scenario.controller.phases
+    for phase in phases:
+        if phase.name == name:
+            return phase
+    raise _missing("controller.phases", f"phase {name!r}", (phase.name for phase in phases))
+
+
+def _missing(field: str, what: str, there: Iterable[str]) -> UsageError:
+    return UsageError(
+        f"{field}: no {what}, which the experiment needs; there are: {', '.join(there) or 'none'}. Leave out the --set"
+        " that takes it away"
+    )
 
 
 def perform(request: ExperimentRequest, scenario: str, directory: Path, overrides: dict[str, Any]) -> RunSeries:
-    """Run a variant of the scenario and read its log.
+    """Run a variant of the scenario and read its log; `overrides` win over the request's at and below them.
 
     Raises:
         RunStoppedError: the HAL stopped the robot.
 
     """
-    run = load_run(scenario, {**request.overrides, **overrides, "seed": request.seed})
+    of_user = {
+        path: value for path, value in request.overrides.items() if not any(_within(path, field) for field in overrides)
+    }
+    run = load_run(scenario, {**of_user, **overrides, "seed": request.seed})
     return read_series(run_to_log(run, directory, processes=request.processes))
 
 
@@ -86,13 +195,6 @@ def oscillation(time_s: Array, signal: Array, release_s: float) -> Array:
     passed = np.logical_or.accumulate(np.sign(away) != np.sign(away[0]), axis=0)
     swing = np.where(passed, away, 0.0)
     return np.asarray(swing.max(axis=0) - swing.min(axis=0), np.float64)
-
-
-def return_time(time_s: Array, path: Array, release_s: float) -> float:
-    """Time [s] at which a point's path (K, 3) is first back within `BACK_SHARE` of its way to rest after a release."""
-    times, away = _after_release(time_s, path, release_s)
-    along = away.dot(away[0])
-    return float(times[np.flatnonzero(along <= BACK_SHARE * along[0])[0]])
 
 
 def _after_release(time_s: Array, signal: Array, release_s: float) -> tuple[Array, Array]:

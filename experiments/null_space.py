@@ -3,6 +3,14 @@
 The same two pushes are made with the null-space compliant law and without it, at the same gains: the tuned set with the
 lower hand gains of the scenario. The elbow's force is `FORCE_OVER_STICTION` times what breaks the true friction of the
 seed's joints (`hand_runs.stiction_force`): below it nothing moves under any law. All figures are the plant's truth.
+
+Without the law there is no `null_space.posture_metric` either: that run's posture task is met in the metric of the
+joints, the other's in that of its scenario (`inertia`). The comparison is of both together; the metric
+`posture_metric` names them. With `--set controller.null_space.posture_metric=joint` both runs have the same one, and
+only the law differs.
+
+The hand has returned when its error stays small from `SETTLE_S` after a release until the next push, or until the end
+of the run. Where the next push leaves less than `LAST_S` of that, the error counts in the last `LAST_S` before it.
 """
 
 from __future__ import annotations
@@ -11,16 +19,27 @@ from typing import Any, Final
 
 import numpy as np
 
+from deploy.errors import UsageError
 from deploy.experiment import Bar, ExperimentRequest, ExperimentResult
 from deploy.series import Array, RunSeries
 from experiments.figures import null_space_figure, save
-from experiments.hand_runs import hand_error, load, perform, rest_position, stiction_force, workplace
+from experiments.hand_runs import (
+    TIME_TOLERANCE_S,
+    hand_error,
+    load,
+    perform,
+    rest_position,
+    stiction_force,
+    workplace,
+)
 from schemas.fingerprint import fingerprint
 from schemas.load import Run
 
 SCENARIO: Final = "arm9-null-space"
 VARIANTS: Final[dict[str, dict[str, Any]]] = {"with": {}, "without": {"controller.null_space": None}}
-OWN_FIELDS: Final = ("controller.null_space", "plant.world.events.elbow.force_in_world")
+PUSHES: Final = ("hand", "elbow")
+OWN_FIELDS: Final = ("plant.world.events.elbow.force_in_world",)
+OWN_WHOLE: Final = ("controller.null_space",)
 ELBOW: Final = "elbow_pitch_link"
 DIRECTION: Final = (0.0, 1.0, 0.0)
 FORCE_OVER_STICTION: Final = 1.25
@@ -29,17 +48,20 @@ ERROR_M: Final = 0.01
 RETURN_M: Final = 0.003
 SETTLE_S: Final = 3.0
 """After a release: the error from then on is the return error."""
+LAST_S: Final = 0.5
+"""The return error is that of at least this time, before the next push or the end."""
 
 
 def run(request: ExperimentRequest) -> ExperimentResult:
     """Run the experiment for one seed, with and without.
 
     Raises:
-        UsageError: an override of what the experiment sets itself.
+        UsageError: an override of what the experiment sets itself, or takes away what it needs.
         RunStoppedError: the HAL stopped a run.
 
     """
-    scenario = load(request, SCENARIO, OWN_FIELDS)
+    scenario = load(request, SCENARIO, OWN_FIELDS, own_whole=OWN_WHOLE, events=PUSHES, after_s=SETTLE_S + LAST_S)
+    _check(scenario)
     stiction = stiction_force(scenario, ELBOW, DIRECTION)
     force = [FORCE_OVER_STICTION * stiction * component for component in DIRECTION]
     with workplace(request) as directory:
@@ -59,12 +81,26 @@ def spans(scenario: Run) -> dict[str, tuple[float, float]]:
     return {event.name: (event.start_s, event.start_s + event.duration_s) for event in events}
 
 
+def _check(scenario: Run) -> None:
+    if ELBOW not in scenario.scenario.plant.truth_frames:
+        raise UsageError(f"plant.truth_frames lacks {ELBOW}, whose motion the experiment measures: name it there")
+    pushes = spans(scenario)
+    first, second = sorted(PUSHES, key=lambda name: pushes[name][0])
+    room_s = pushes[second][0] - pushes[first][1]
+    if room_s < LAST_S - TIME_TOLERANCE_S:
+        raise UsageError(
+            f"plant.world.events: {second!r} begins {room_s:g} s after the end of {first!r}; let it begin at least"
+            f" {LAST_S:g} s after, so that the hand's return is seen"
+        )
+
+
 def _result(request: ExperimentRequest, scenario: Run, runs: dict[str, RunSeries], stiction: float) -> ExperimentResult:
     robot, pushes = scenario.robot.description, spans(scenario)
     metrics: dict[str, Any] = {
         "gains": scenario.scenario.controller.gains or "own",
         "elbow_stiction_n": stiction,
         "elbow_force_n": FORCE_OVER_STICTION * stiction,
+        "posture_metric": {name: posture_metric(series.run) for name, series in runs.items()},
     }
     bars = []
     moved = {}
@@ -72,7 +108,7 @@ def _result(request: ExperimentRequest, scenario: Run, runs: dict[str, RunSeries
         time_s, error = hand_error(series)
         distance = np.linalg.norm(error, axis=1)
         moved[name] = elbow_displacement(series, pushes["elbow"])
-        back = [_return_error(time_s, distance, pushes, event) for event in pushes]
+        back = [_return_error(time_s, distance, pushes, event) for event in PUSHES]
         metrics |= {
             f"{name}_elbow_displacement_m": moved[name],
             f"{name}_hand_error_max_m": float(distance.max()),
@@ -99,13 +135,20 @@ def elbow_displacement(series: RunSeries, push: tuple[float, float]) -> float:
     return float(np.linalg.norm(elbow[first : last + 1] - elbow[first], axis=1).max())
 
 
+def posture_metric(run: Run) -> str:
+    """Name the metric of the run's posture task, which without null-space compliance is that of the joints."""
+    null_space = run.scenario.controller.null_space
+    return "joint" if null_space is None else null_space.posture_metric
+
+
 def _return_error(time_s: Array, distance: Array, pushes: dict[str, tuple[float, float]], event: str) -> float:
-    """Largest error [m] from `SETTLE_S` after a push until the next one, or at the end if that comes first."""
-    begin = min(pushes[event][1] + SETTLE_S, float(time_s[-1]) - 0.1)
+    """Largest error [m] from `SETTLE_S` after a push, or from `LAST_S` before the next one or the end if that is less.
+
+    Up to the next push, or to the end.
+    """
     later = [start for start, _ in pushes.values() if start > pushes[event][0]]
     end = min(later, default=float(time_s[-1]))
-    if begin >= end:
-        begin = end - 0.1
+    begin = min(pushes[event][1] + SETTLE_S, end - LAST_S)
     return _largest(time_s, distance, (begin, end))
 
 

@@ -24,7 +24,7 @@ APART_S: Final = 0.2
 """Touches of a pole nearer in time than this are one contact."""
 MEAN_S: Final = 0.05
 IMPACT_S: Final = 0.05
-"""Around the beginning of a contact: where the energy of its impact is looked for."""
+"""Around the touches of an obstacle: where the energy of impacts is looked for."""
 
 
 def run(request: ExperimentRequest) -> ExperimentResult:
@@ -78,15 +78,18 @@ def _result(request: ExperimentRequest, scenario: Run, series: RunSeries) -> Exp
         "error_rms_xyz_m": np.sqrt(np.mean(error**2, axis=0)).tolist(),
         "orientation_error_max_rad": float(angle.max()),
         "contacts": len(begins),
+        "contacts_by_obstacle": {name: float(len(times)) for name, times in contacts.items()},
+        "links_touched": sorted({sample.link for samples in truth.contacts for sample in samples}),
         "contact_force_max_n": {name: float(_forces(series, name).max()) for name in contacts},
         "contact_force_mean_50ms_max_n": {name: _largest_mean(series, name) for name in contacts},
-        "kinetic_energy_at_impacts_max_j": _impact_energy(truth.time_s, truth.kinetic_energy, begins),
+        "kinetic_energy_at_impacts_max_j": _impact_energy(series),
         "torque_commanded_over_limit_max": over,
         "torque_applied_over_limit_max": applied,
     }
     bars = (
         Bar("laps_done", laps, wanted - 0.01, at_least=True),
         Bar("contacts", float(len(begins)), float(CONTACTS), at_least=True),
+        Bar("contacts_of_an_obstacle_min", float(min(map(len, contacts.values()), default=0)), 1.0, at_least=True),
         Bar("error_max_y_m", float(largest[1]), ERROR_M),
         Bar("error_max_z_m", float(largest[2]), ERROR_M),
         Bar("torque_commanded_over_limit_max", over, 1.0),
@@ -124,7 +127,11 @@ def _largest_mean(series: RunSeries, name: str) -> float:
     return float(np.convolve(_forces(series, name), np.full(width, 1.0 / width), "valid").max())
 
 
-def _impact_energy(time_s: Array, energy: Array, begins: list[float]) -> float:
-    """Largest kinetic energy [J] just before and during the beginning of a contact."""
-    peaks = [float(energy[np.abs(time_s - begin) <= IMPACT_S].max()) for begin in begins]
-    return max(peaks, default=0.0)
+def _impact_energy(series: RunSeries) -> float:
+    """Largest kinetic energy [J] within `IMPACT_S` of any touch of an obstacle."""
+    energy = series.truth.kinetic_energy
+    names = {obstacle.name for obstacle in series.run.scenario.plant.world.obstacles}
+    touching = np.array([any(sample.other in names for sample in samples) for samples in series.truth.contacts])
+    width = round(IMPACT_S / series.run.robot.description.period_s)
+    near = np.convolve(touching, np.ones(2 * width + 1), "same")[: len(energy)] > 0.5
+    return float(energy[near].max(initial=0.0))

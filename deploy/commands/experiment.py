@@ -40,40 +40,51 @@ def experiment(
     processes: Annotated[bool, typer.Option("--processes", help="Services as separate processes.")] = False,
     json_: opt.Json = False,
 ) -> None:
-    """Run an experiment, compare its metrics with their limits; exits 1 when one does not hold."""
+    """Run an experiment, compare its metrics with their limits; exits 1 when one does not hold or a run failed.
+
+    Writes logs, figures and metrics.json to runs/NAME; of several seeds, a folder for each and a metrics.json of all.
+    """
     from dataclasses import replace
     from functools import partial
 
     from rich.table import Table
 
-    from deploy.experiment import combine, find_experiment, seed_requests
+    from deploy.errors import DeployError
+    from deploy.experiment import ExperimentResult, FailedRun, attempt, combine, find_experiment, seed_requests
 
     run = find_experiment(name)
     directory = out or Path("runs") / name
     requests = seed_requests(
         range(seed, seed + seeds), opt.overrides(sets), directory, vary=vary, processes=processes, apart=seeds > 1
     )
-    results = []
+    outcomes = []
     with SeedsDisplay(f"experiment {name}", seeds) as display:
         for request in requests:
-            results.append(run(replace(request, progress=partial(display.tell, request.seed))))
-            display.done(results[-1])
-            write_outcome(results[-1], request.directory)
+            outcomes.append(attempt(run, replace(request, progress=partial(display.tell, request.seed))))
+            display.done(outcomes[-1])
+            write_outcome(outcomes[-1], request.directory)
+    printed = outcomes[0].as_json() if seeds == 1 else combine(name, outcomes)
+    if seeds > 1:
+        opt.write_json(printed, directory / "metrics.json")
     if json_:
-        opt.print_json(results[0].as_json() if seeds == 1 else combine(name, results))
-    else:
-        table = Table(title=f"{name} on {results[0].robot}", title_justify="left")
+        opt.print_json(printed)
+    if seeds == 1 and isinstance(outcomes[0], FailedRun):
+        raise DeployError(outcomes[0].error)
+    results = [outcome for outcome in outcomes if isinstance(outcome, ExperimentResult)]
+    if not json_:
+        table = Table(title=f"{name} on {results[0].robot}" if results else name, title_justify="left")
         for header in ("seed", "what", "value", "limit", "holds"):
             table.add_column(header, justify="right" if header in ("value", "limit") else "left")
         for result in results:
             for bar in result.bars:
                 sign, verdict = "≥" if bar.at_least else "≤", "[green]yes" if bar.holds else "[red]no"
                 table.add_row(str(result.seed), bar.name, f"{bar.value:.4g}", f"{sign} {bar.limit:.4g}", verdict)
-        show(table)
+        if results:
+            show(table)
         if seeds > 1:
-            show(summary(name, results))
+            show(summary(name, outcomes))
         typer.echo(directory)
-    if not all(result.passed for result in results):
+    if not all(outcome.passed for outcome in outcomes):
         raise typer.Exit(1)
 
 

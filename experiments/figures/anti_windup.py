@@ -31,6 +31,7 @@ METHODS: Final = {
     "none": "Without anti-windup",
     "scaling": r"Scaling, $\tilde{u}_K = \lambda_w u_K$ (10)",
     "qp": "QP-based anti-windup (11)",
+    "conditioned": "(11) and back-calculation",
 }
 """From top to bottom."""
 BEFORE_S: Final = 1.0

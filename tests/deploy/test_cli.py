@@ -68,6 +68,10 @@ def test_help_names_all_commands_and_loads_no_heavy_library(capsys: pytest.Captu
         (["report", "nosuch.mcap"], 2, "nosuch.mcap"),
         (["replay", "nosuch.mcap"], 2, "nosuch.mcap"),
         (["experiment", "nosuch"], 2, "nosuch"),
+        (["experiment", "null-space", "--set", "duration_s=5"], 2, "--set duration_s=17 or more"),
+        (["experiment", "null-space", "--set", "seedling=5"], 2, "seedling"),
+        (["experiment", "null-space", "--set", "plant.world.events=[]"], 2, "the experiment sets it itself"),
+        (["experiment", "null-space", "--seeds", "2", "--set", "controller.null_space=null"], 2, "sets it itself"),
         (["sweep", "nosuch"], 2, "transition"),
         (["sweep", "transition", "--jobs", "0"], 2, "--jobs"),
         (["sweep", "transition", "--seeds", "0"], 2, "--seeds"),
@@ -77,8 +81,15 @@ def test_help_names_all_commands_and_loads_no_heavy_library(capsys: pytest.Captu
     ],
 )
 def test_bad_usage_is_one_short_message_without_traceback(
-    arguments: list[str], code: int, named: str, runtime: Path, capfd: pytest.CaptureFixture[str]
+    arguments: list[str],
+    code: int,
+    named: str,
+    runtime: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)  # experiments make room in runs/ below it
     assert main(arguments) == code
     captured = capfd.readouterr()
     assert named in captured.err

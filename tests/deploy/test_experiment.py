@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import datetime
 import json
 import math
 from pathlib import Path
@@ -7,17 +8,20 @@ from pathlib import Path
 import pytest
 
 import experiments
-from deploy.errors import UsageError
+from deploy.errors import RunStoppedError, UsageError
 from deploy.experiment import (
     Bar,
+    ExperimentRequest,
     ExperimentResult,
     FailedRun,
+    attempt,
     combine,
     experiment_names,
     find_experiment,
     seed_requests,
     summarize,
 )
+from schemas.errors import ConfigurationError
 
 
 def result(*bars: Bar, seed: int = 0, value: float = 0.001) -> ExperimentResult:
@@ -47,7 +51,7 @@ def test_a_bar_holds_exactly_where_its_margin_is_not_negative(value: float, at_l
 def test_json_holds_what_is_promised() -> None:
     given = result(Bar("step", math.nan, 0.01), value=math.inf)
     content = json.loads(json.dumps(given.as_json(), allow_nan=False))
-    assert set(content) == {"experiment", "robot", "seed", "versions", "metrics", "bars", "passed"}
+    assert set(content) == {"experiment", "robot", "seed", "versions", "overrides", "metrics", "bars", "passed"}
     assert content["passed"] is False
     assert content["metrics"] == {"torque_step_max": None}
 
@@ -94,7 +98,7 @@ def test_limits_that_differ_between_seeds_are_compared_by_margin() -> None:
 def test_a_failed_run_is_a_failure_without_values() -> None:
     combined = combine("transition", [*seeds(1.0, 2.0), FailedRun(7, "the HAL stopped")])
     assert (combined["seeds"], combined["seeds_passed"], combined["passed"]) == (3, 2, False)
-    assert combined["runs"][2] == {"seed": 7, "error": "the HAL stopped"}
+    assert combined["runs"][2] == {"seed": 7, "error": "the HAL stopped", "overrides": {}}
     assert (combined["bars"][0]["holds_count"], combined["bars"][0]["median"]) == (2, 1.5)
     nothing = combine("transition", [FailedRun(7, "the HAL stopped")])
     assert (nothing["robot"], nothing["bars"], nothing["passed"]) == (None, [], False)
@@ -121,3 +125,48 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="file/seed-0: cannot be made"):
         seed_requests([0], {}, tmp_path / "file", vary=False)
+
+
+def test_outcomes_say_what_was_set() -> None:
+    def stop(_: ExperimentRequest) -> ExperimentResult:
+        raise RunStoppedError("joint too fast")
+
+    def refuse(_: ExperimentRequest) -> ExperimentResult:
+        raise ConfigurationError("no field x")
+
+    request = ExperimentRequest(7, {"plant.torque_scale": 0.87})
+    assert attempt(lambda _: result(seed=7), request).as_json()["overrides"] == {"plant.torque_scale": 0.87}
+    assert attempt(stop, request) == FailedRun(7, "joint too fast", {"plant.torque_scale": 0.87})
+    with pytest.raises(UsageError, match="no field x"):
+        attempt(refuse, request)
+
+
+def test_any_override_that_yaml_knows_has_a_place_in_json() -> None:
+    given = {
+        "a": math.inf, "b": [math.nan, 1, True, None], "c": {1: datetime.date(2024, 5, 6)}, "d": {"only"}, "e": 0.1,
+    }  # fmt: skip
+    for outcome in (attempt(lambda _: result(), ExperimentRequest(0, given)), FailedRun(0, "stopped", given)):
+        assert json.loads(json.dumps(outcome.as_json(), allow_nan=False))["overrides"] == {
+            "a": "inf", "b": ["nan", 1, True, None], "c": {"1": "2024-05-06"}, "d": "{'only'}", "e": 0.1,
+        }  # fmt: skip
+
+
+OLD = (
+    "metrics.json", "sweep.png", "null-space.png", "null-space.svg", "transition.png", "bent/to_torque.png",
+    "bent/to_position.png", "seed-1/metrics.json", "seed-1/null-space.svg", "seed-1/bent/to_torque.png",
+)  # fmt: skip
+KEPT = ("holiday.png", "notes/plan.svg", "metrics.json.old", "bent/run.mcap", "seed-2/metrics.json")
+
+
+def test_results_of_an_earlier_run_are_deleted_and_nothing_else(tmp_path: Path) -> None:
+    for name in (*OLD, *KEPT):
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).write_text("old")
+    seed_requests(range(2), {}, tmp_path, vary=False)
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == set(KEPT)
+
+
+def test_an_old_result_that_cannot_be_deleted_is_named(tmp_path: Path) -> None:
+    (tmp_path / "metrics.json").mkdir()
+    with pytest.raises(UsageError, match=r"metrics\.json: an old result, cannot be deleted"):
+        seed_requests([0], {}, tmp_path, vary=False, apart=False)

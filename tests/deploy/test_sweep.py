@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ def test_outcomes_come_in_the_order_of_the_seeds_whoever_is_first(tmp_path: Path
     assert sorted(finished) == [0, 1, 2, 3]
     assert finished[-1] == 0
     assert {(each.seed, each.what) for each in heard} == {(seed, w) for seed in range(4) for w in ("starting", "half")}
-    assert outcomes[2] == FailedRun(2, "stopped at sequence 7: joint too fast")
+    assert outcomes[2] == FailedRun(2, "stopped at sequence 7: joint too fast", requests[2].overrides)
     assert [outcome.passed for outcome in outcomes] == [True, True, False, True]
 
 
@@ -146,7 +147,8 @@ def test_a_real_sweep_has_the_results_of_the_same_runs_one_by_one(
     requests = seed_requests(range(2), {"robot": str(CRANE)}, tmp_path, vary=True)
     outcomes = sweep(tiny_experiment.short_transition, requests, 2)
     assert [outcome.passed for outcome in outcomes] == [True, True]
-    assert outcomes[1] == tiny_experiment.short_transition(requests[1])
+    alone = tiny_experiment.short_transition(requests[1])
+    assert outcomes[1] == replace(alone, overrides=vary(1) | {"robot": str(CRANE)})
     assert outcomes[0].as_json()["metrics"] != outcomes[1].as_json()["metrics"]
     assert len(list(tmp_path.rglob("*.png"))) == 4
     assert not list(tmp_path.rglob("seed-0/**/run.mcap"))
@@ -168,6 +170,7 @@ def test_the_json_of_the_command_and_its_files(
     assert [run["metrics"]["torque_scale"] for run in printed["runs"]] == [
         vary(seed)["plant.torque_scale"] for seed in (4, 5, 6)
     ]
+    assert [run["overrides"] for run in printed["runs"]] == [vary(seed) for seed in (4, 5, 6)]
     del printed["runs"]
     bar = {
         "name": "seed", "limit": 1000.0, "at_least": False, "holds_count": 3,
@@ -182,7 +185,8 @@ def test_the_json_of_the_command_and_its_files(
     printed = json.loads(capsys.readouterr().out)
     assert (printed["seeds_passed"], printed["passed"], printed["bars"][0]["holds_count"]) == (1, False, 1)
     assert printed["runs"][0]["metrics"]["torque_scale"] is None
-    assert printed["runs"][1] == {"seed": 5, "error": "stopped at sequence 7: joint too fast"}
+    failed = {"seed": 5, "error": "stopped at sequence 7: joint too fast", "overrides": {"stop": [5], "miss": [6]}}
+    assert printed["runs"][1] == failed
     assert json.loads((tmp_path / "seed-5" / "metrics.json").read_text()) == printed["runs"][1]
 
 
@@ -217,6 +221,53 @@ def test_experiment_repeats_a_run_of_a_sweep_and_sums_up_several(
     printed = capsys.readouterr().out
     assert "1 of 2 seeds pass" in printed
     assert "1/2" in printed
+
+
+def test_a_seed_that_fails_does_not_end_an_experiment_of_several(
+    tiny_for_all: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["experiment", "tiny", "--out", str(tmp_path), "--seeds", "3", "--set", "stop=[0]", "--set", "miss=[2]"]
+    assert main([*line, "--json"]) == 1
+    captured = capsys.readouterr()
+    printed = json.loads(captured.out)
+    assert captured.err == ""
+    assert printed == json.loads((tmp_path / "metrics.json").read_text())
+    assert (printed["seeds"], printed["seeds_passed"], printed["passed"]) == (3, 1, False)
+    failed = {"seed": 0, "error": "stopped at sequence 7: joint too fast", "overrides": {"stop": [0], "miss": [2]}}
+    assert printed["runs"][0] == failed == json.loads((tmp_path / "seed-0" / "metrics.json").read_text())
+    assert printed["runs"][1]["overrides"] == failed["overrides"]
+
+    assert main(line) == 1
+    table = capsys.readouterr().out
+    assert "seed 0: stopped at sequence 7: joint too fast" in table
+    assert "1 of 3 seeds pass" in table
+    assert main([*line, "--set", "stop=[0, 1, 2]"]) == 1
+    assert "0 of 3 seeds pass" in capsys.readouterr().out
+
+
+def test_one_seed_that_fails_is_an_error_and_leaves_it_in_its_file(
+    tiny_for_all: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["experiment", "tiny", "--out", str(tmp_path), "--json"]
+    assert main(line) == 0
+    passed = json.loads(capsys.readouterr().out)
+    assert passed == json.loads((tmp_path / "metrics.json").read_text())
+    assert main([*line, "--set", "stop=[0]"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err == "cosim: stopped at sequence 7: joint too fast\n"
+    failed = {"seed": 0, "error": "stopped at sequence 7: joint too fast", "overrides": {"stop": [0]}}
+    assert json.loads(captured.out) == failed == json.loads((tmp_path / "metrics.json").read_text())
+
+
+def test_a_run_that_comes_to_no_end_leaves_no_older_results(
+    tiny_for_all: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["experiment", "tiny", "--out", str(tmp_path)]
+    assert main([*line, "--json"]) == 0
+    (tmp_path / "null-space.svg").write_text("old")
+    assert main([*line, "--json", "--set", "bug=[0]"]) == 1
+    assert "internal error" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.json")) + list(tmp_path.glob("*.svg"))
 
 
 def test_a_configuration_that_no_seed_can_run_with_is_bad_usage(

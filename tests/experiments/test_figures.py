@@ -173,7 +173,7 @@ def test_null_space_shades_every_push_once_and_says_its_force() -> None:
     rights = [axis for axis in figure.axes if axis.get_ylabel() == "shoulder yaw [°]"]
     assert len(rights) == 2
     for axis in (*rights, by_title(figure, "Elbow")):
-        assert_allclose(shaded(axis), [(3.0, 5.5), (7.5, 12.0)])
+        assert_allclose(shaded(axis), [(3.0, 5.5), (9.0, 13.5)])
     for row in rows:
         assert [text.get_text() for text in row.texts] == ["hand pushed,\n60 N", "elbow pushed,\n240 N"]
         assert [line.get_label()[:12] for line in row.lines] == ["hand error x", "hand error y", "hand error z"]

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from controller_service.model import RobotModel
 from deploy.errors import UsageError
 from deploy.experiment import ExperimentRequest
-from experiments.hand_runs import END_S, WINDOW_S, load, oscillation, settling_time, stiction_force
+from deploy.series import RunSeries
+from experiments import hand_runs
+from experiments.hand_runs import (
+    END_S,
+    WINDOW_S,
+    end_of,
+    event_of,
+    load,
+    oscillation,
+    perform,
+    phase_named,
+    settling_time,
+    stiction_force,
+)
 from plant_service.model import build, initial_position
-from schemas.load import load_run
+from schemas.errors import ConfigurationError
+from schemas.load import Run, load_run
 
 TIME = np.arange(0.0, 6.0, 0.002)
 ELBOW = "elbow_pitch_link"
@@ -66,3 +83,101 @@ def test_what_an_experiment_sets_itself_cannot_be_set() -> None:
         load(ExperimentRequest(0, {"controller.null_space.fade_s": 1}), "arm9-null-space", ("controller.null_space",))
     run = load(ExperimentRequest(4, {"plant.torque_scale": 0.87}), "arm9-null-space")
     assert (run.scenario.seed, run.scenario.plant.torque_scale) == (4, 0.87)
+
+
+NULL_SPACE = "controller.null_space"
+FORCE = "plant.world.events.elbow.force_in_world"
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "own", "own_whole"),
+    [
+        (FORCE, [0, 1, 0], (FORCE,), ()),
+        ("plant.world.events.elbow.force_in_world.1", 5, (FORCE,), ()),
+        ("plant.world.events.1.force_in_world", [0, 1, 0], (FORCE,), ()),
+        ("plant.world.events.1.force_in_world.0", 5, (FORCE,), ()),
+        ("plant.world.events", [], (FORCE,), ()),
+        ("plant.world", {}, (FORCE,), ()),
+        ("controller.null_space.fade_s", 1, (NULL_SPACE,), ()),
+        (NULL_SPACE, None, (), (NULL_SPACE,)),
+        ("controller", {"phases": [{"name": "a", "mode": "torque", "duration_s": 1}]}, (), (NULL_SPACE,)),
+    ],
+)
+def test_own_fields_are_refused_at_above_and_below(
+    path: str, value: Any, own: tuple[str, ...], own_whole: tuple[str, ...]
+) -> None:
+    with pytest.raises(UsageError, match=f"^--set {path}: the experiment sets it itself"):
+        load(ExperimentRequest(0, {path: value}), "arm9-null-space", own, own_whole=own_whole)
+
+
+def test_fields_beside_and_below_those_set_as_a_whole_are_the_users() -> None:
+    overrides = {
+        "controller.null_space.posture_metric": "joint",
+        "plant.world.events.elbow.start_s": 9.5,
+        "plant.world.events.0.force_in_world": [0, 50, 0],
+    }
+    run = load(ExperimentRequest(0, overrides), "arm9-null-space", (FORCE,), own_whole=(NULL_SPACE,))
+    null_space = run.scenario.controller.null_space
+    assert null_space is not None
+    assert null_space.posture_metric == "joint"
+    assert (event_of(run, "elbow").start_s, end_of(event_of(run, "hand"))) == (9.5, 5.5)
+    with pytest.raises(ConfigurationError, match="seedling") as caught:
+        load(ExperimentRequest(0, {"seedling": 5}), "arm9-null-space")
+    assert not isinstance(caught.value, UsageError)
+
+
+def test_a_run_without_a_part_drops_what_the_user_set_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    given: list[Run] = []
+
+    def keep(run: Run, directory: Path, *, processes: bool) -> Path:
+        given.append(run)
+        return directory
+
+    monkeypatch.setattr(hand_runs, "run_to_log", keep)
+    monkeypatch.setattr(hand_runs, "read_series", lambda _: RunSeries)
+    request = ExperimentRequest(4, {"controller.null_space.fade_s": 0.3, "plant.torque_scale": 0.87})
+    perform(request, "arm9-null-space", tmp_path, {})
+    perform(request, "arm9-null-space", tmp_path, {NULL_SPACE: None})
+    with_part, without = (run.scenario for run in given)
+    assert with_part.controller.null_space is not None
+    assert with_part.controller.null_space.fade_s == 0.3
+    assert without.controller.null_space is None
+    assert [scenario.plant.torque_scale for scenario in (with_part, without)] == [0.87, 0.87]
+    assert [scenario.seed for scenario in (with_part, without)] == [4, 4]
+
+
+def test_what_an_experiment_needs_is_missed_by_name() -> None:
+    with pytest.raises(UsageError, match=r"no event 'person', .* there are: hand, elbow\. Leave out"):
+        load(ExperimentRequest(0), "arm9-null-space", events=("hand", "person"))
+    with pytest.raises(UsageError, match=r"no event 'person', .* there are: none"):
+        load(ExperimentRequest(0, {"plant.world.events": []}), "arm9-anti-windup", events=("person",))
+    run = load_run("arm9-null-space")
+    assert phase_named(run, "hold").duration_s == 16.5
+    with pytest.raises(UsageError, match=r"no phase 'lead', .* there are: settle, hold"):
+        phase_named(run, "lead")
+
+
+@pytest.mark.parametrize(
+    ("scenario", "event", "end_s"), [("arm9-null-space", "elbow", 13.5), ("arm9-dual-compliance", "hand", 12.7)]
+)
+def test_time_is_left_after_the_last_event_has_let_go(scenario: str, event: str, end_s: float) -> None:
+    events = ("hand", "elbow")
+    assert end_of(event_of(load_run(scenario), event)) == pytest.approx(end_s)
+    left_s = load_run(scenario).scenario.duration_s - end_s
+    load(ExperimentRequest(0), scenario, events=events, after_s=left_s)
+    with pytest.raises(UsageError, match=f"event '{event}' ends at {end_s:g} s .* --set duration_s=17.01 or more"):
+        load(ExperimentRequest(0), scenario, events=events, after_s=left_s + 0.01)
+    with pytest.raises(UsageError, match="duration_s 5 s is too short"):
+        load(ExperimentRequest(0, {"duration_s": 5}), scenario, events=events)
+
+
+def test_events_act_in_torque_mode() -> None:
+    path = "controller.phases.settle.duration_s"
+    load(ExperimentRequest(0, {path: 3}), "arm9-null-space", events=("hand",))
+    with pytest.raises(UsageError, match=r"'settle' is in mode position from 0 s on.* event 'hand' at 3 s to 5\.5 s"):
+        load(ExperimentRequest(0, {path: 3.1}), "arm9-null-space", events=("hand",))
+    later = [{"name": "a", "mode": "torque", "duration_s": 6}, {"name": "b", "mode": "position", "duration_s": 6}]
+    request = ExperimentRequest(0, {"controller.phases": later})
+    load(request, "arm9-null-space", events=("hand",), after_s=0.5)
+    with pytest.raises(UsageError, match="'b' is in mode position from 6 s on"):
+        load(request, "arm9-null-space", events=("hand",), after_s=0.6)
