@@ -36,8 +36,6 @@ class CollisionRows:
     """Capsules of the rows in use; an obstacle is the second of its pair."""
     distances: Array
     """d (rows in use,) [m] between the surfaces, negative in penetration."""
-    nearest: float
-    """Smallest distance [m] of all pairs, with a row or without."""
 
 
 class CollisionModel:
@@ -123,14 +121,13 @@ class CollisionModel:
         fastest = self._fastest.dot(np.abs(v))
         ahead = np.maximum(fastest * fastest - self._config.damping**2, 0.0) / (2.0 * self.braking)
         near = (d < self._config.influence_m + ahead).nonzero()[0]
-        nearest = float(d.min())
         if not len(near):
-            return CollisionRows(self._unused, self._unbounded, (), d[:0], nearest)
+            return CollisionRows(self._unused, self._unbounded, (), d[:0])
         if len(near) > self.max_pairs:
             near = np.sort(near[np.argsort(d[near], kind="stable")[: self.max_pairs]])
-        return self._bounds(near, d[near], q, v, nearest)
+        return self._bounds(near, d[near], q, v)
 
-    def _bounds(self, near: NDArray[np.intp], d: Array, q: Array, v: Array, nearest: float) -> CollisionRows:
+    def _bounds(self, near: NDArray[np.intp], d: Array, q: Array, v: Array) -> CollisionRows:
         pin.computeJointJacobiansTimeVariation(self._model, self._data, q, v)
         screws, rates, moves = self._data.J, self._data.dJ, self._moves[near]
         twists = (screws * v).dot(self._supports).T.tolist()
@@ -147,7 +144,7 @@ class CollisionModel:
         A, bounds = self._unused.copy(), self._unbounded.copy()
         A[: len(d)] = gradient if self._order is None else gradient[:, self._order]
         bounds[: len(d)] = lower
-        return CollisionRows(A, bounds, tuple([self.pairs[k] for k in near.tolist()]), d, nearest)
+        return CollisionRows(A, bounds, tuple([self.pairs[k] for k in near.tolist()]), d)
 
     def _allowed_speed(self, d: Array) -> Array:
         xi, safe, influence = self._config.damping, self._config.safe_m, self._config.influence_m

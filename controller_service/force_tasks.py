@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from controller_service.model import Array, Configuration
-from controller_service.tasks import PoseTarget, PoseTask, orientation_error
+from controller_service.tasks import PoseTarget, PoseTask, pose_error
 from controller_service.wrench import HandWrench
 from schemas.control_law import Admittance, WrenchTask
 from schemas.controller import TaskGains
@@ -96,10 +96,7 @@ class HybridPoseTask:
     def linear(self) -> tuple[Array, Array]:
         """Return A (k, n), b (k,), k the number of `rows`."""
         now, target, gains = self.configuration.frames[self.frame], self.target, self.gains
-        error = np.empty(6)
-        error[:3] = target.position - now.position
-        error[3:] = orientation_error(target.rotation, now.rotation)
-        objective: Array = gains.stiffness * error
+        objective: Array = gains.stiffness * pose_error(target, now)
         objective += gains.damping * (target.velocity - now.velocity)
         objective += target.acceleration
         objective += gains.force * (self.measured.wrench - self.reference.wrench)

@@ -8,7 +8,7 @@ from typing import ClassVar, Final, Protocol
 import numpy as np
 import pinocchio as pin
 
-from controller_service.model import Array, Configuration
+from controller_service.model import Array, Configuration, FrameKinematics
 from schemas.controller import TaskGains
 
 
@@ -122,10 +122,7 @@ class PoseTask:
     def linear(self) -> tuple[Array, Array]:
         """Return A (k, n), b (k,), k the number of `rows`."""
         now, target, gains = self.configuration.frames[self.frame], self.target, self.gains
-        error = np.empty(6)
-        error[:3] = target.position - now.position
-        error[3:] = orientation_error(target.rotation, now.rotation)
-        objective: Array = gains.stiffness * error
+        objective: Array = gains.stiffness * pose_error(target, now)
         objective += gains.damping * (target.velocity - now.velocity)
         objective += target.acceleration
         objective -= now.drift
@@ -155,6 +152,14 @@ class OrientationTask(PoseTask):
 
 FRAME_TASKS: Final = {"pose": PoseTask, "position": PositionTask, "orientation": OrientationTask}
 """By the names of `ControllerConfig.hand_task`."""
+
+
+def pose_error(target: PoseTarget, now: FrameKinematics) -> Array:
+    """[p^d − p; Ω̃] (6,) of (7) and (8), world axes."""
+    error = np.empty(6)
+    error[:3] = target.position - now.position
+    error[3:] = orientation_error(target.rotation, now.rotation)
+    return error
 
 
 def orientation_error(desired: Array, current: Array) -> Array:

@@ -77,8 +77,6 @@ class HandWrenchEstimator:
                 f"controller.hand_force: robot {description.name} has no hand_frame; name the URDF link of its hand"
             )
         self.hand_frame: str = hand
-        self.frames: tuple[str, ...] = (hand,)
-        """Frames that the `RobotModel` of the configurations must have; the sensor's is fixed to the hand's."""
         beyond = _body_beyond(robot, config.sensor, frame)
         if not beyond.existFrame(hand, pin.FrameType.BODY):
             raise ConfigurationError(
@@ -125,7 +123,7 @@ class HandWrenchEstimator:
 
         Args:
             sample: the sensor's, of this state.
-            now: configuration at this state, with `frames`.
+            now: configuration at this state, with the hand frame.
             cycles: periods since the last call.
             acceleration: q̈ (n,) [rad/s²] of this state; None: from differences of `now.velocity`, 0 at the first call.
 

@@ -7,6 +7,8 @@ trace, all motion from the plant's truth, forces from the sensor. Gains are thos
 **Oscillation** is the peak to peak of a signal in the two seconds after the release, from when it first passes where it
 comes to rest: the way back is no oscillation (`hand_runs.oscillation`). Forces have no rest to pass: theirs is the peak
 to peak from `FORCE_FROM_S` after the release, the same window in every run, the start of the way back included.
+Joints that are not saturated are compared with plain scaling in units of the band in which stiction alone decides
+where a joint rests (`hand_runs.stiction_band`).
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from experiments.hand_runs import (
     perform,
     rest_position,
     settling_time,
+    stiction_band,
     workplace,
 )
 from schemas.fingerprint import fingerprint
@@ -48,8 +51,6 @@ RATIO: Final = 3.0
 SETTLED_M: Final = 0.005
 SMALLEST_M: Final = 1e-4
 """A smaller oscillation of the hand counts as this: some counts of an encoder."""
-SAME_RAD: Final = 1e-4
-"""Oscillations of a joint that differ by less are equal: 16 counts of an encoder."""
 RANGE_MARGIN_RAD: Final = 0.05
 """Closer to its range, a joint's limit and not the anti-windup would decide what happens."""
 
@@ -90,6 +91,8 @@ def _result(request: ExperimentRequest, scenario: Run, runs: dict[str, RunSeries
     hand = {method: metrics[f"{method}_hand_oscillation_m"] for method in runs}
     joints = {method: np.array(metrics[f"{method}_joint_oscillation_rad"]) for method in runs}
     free = peak["qp"] < 1.0 - 1e-9
+    band = stiction_band(scenario)
+    metrics["stiction_band_rad"] = band.tolist()
     metrics["joints_not_saturated"] = [name for name, is_free in zip(robot.joint_names, free, strict=True) if is_free]
     metrics["force_oscillation_none_over_qp"] = metrics["none_force_oscillation_n"] / metrics["qp_force_oscillation_n"]
     margin = min(metrics[f"{method}_range_margin_min_rad"] for method in runs)
@@ -98,7 +101,7 @@ def _result(request: ExperimentRequest, scenario: Run, runs: dict[str, RunSeries
         Bar("qp_windup_over_bound_max", metrics["qp_windup_over_bound_max"], 1.0),
         Bar("none_windup_over_limit_max", float(peak["none"].max()), GROWTH, at_least=True),
         Bar("hand_oscillation_none_over_qp", hand["none"] / max(hand["qp"], SMALLEST_M), RATIO, at_least=True),
-        Bar("free_joint_oscillation_excess_rad", excess(joints["qp"], joints["scaling"], free), SAME_RAD),
+        Bar("free_joint_oscillation_excess", excess(joints["qp"] / band, joints["scaling"] / band, free), 1.0),
         Bar("range_margin_min_rad", margin, RANGE_MARGIN_RAD, at_least=True),
     )
     return ExperimentResult("anti-windup", robot.name, request.seed, fingerprint(scenario), metrics, bars)

@@ -221,6 +221,23 @@ def rest_position(series: RunSeries, time_s: float) -> tuple[int, float]:
     return index, float(series.truth.time_s[index])
 
 
+def true_breakaway(run: Run) -> Array:
+    """Breakaway torques (n,) [N·m] of this run's plant, at the joints."""
+    factors = build(run.robot, run.scenario.plant, run.scenario.seed).friction_factors
+    gears = np.array([joint.gear_ratio for joint in run.robot.description.joints])
+    return np.asarray(run.scenario.plant.friction.breakaway * gears * factors, np.float64)
+
+
+def stiction_band(run: Run) -> Array:
+    """Distance (n,) [rad] from its place at which stiction can hold a joint: b_i / (K_p M_ii), K_p the hand task's.
+
+    Within it the place of rest is a matter of chance; only what swings farther is oscillation.
+    """
+    model = RobotModel(run.robot)
+    mass = model.configure(initial_position(run.robot, run.scenario.plant), np.zeros(model.n)).mass
+    return np.asarray(true_breakaway(run) / (run.scenario.controller.hand.stiffness * mass.diagonal()), np.float64)
+
+
 def stiction_force(run: Run, link: str, direction_in_world: tuple[float, float, float]) -> float:
     """Least force [N] at a link's origin that breaks the true stiction without moving the hand, at the start posture.
 
@@ -232,9 +249,7 @@ def stiction_force(run: Run, link: str, direction_in_world: tuple[float, float, 
     hand = robot.description.hand_frame
     if hand is None:
         raise UsageError(f"robot {robot.description.name} has no hand_frame, which the experiment moves")
-    factors = build(robot, plant, run.scenario.seed).friction_factors
-    gears = np.array([joint.gear_ratio for joint in robot.description.joints])
-    breakaway = plant.friction.breakaway * gears * factors
+    breakaway = true_breakaway(run)
     model = RobotModel(robot, (hand, link))
     n = model.n
     now = model.configure(initial_position(robot, plant), np.zeros(n))
