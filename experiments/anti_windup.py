@@ -51,6 +51,8 @@ RATIO: Final = 3.0
 SETTLED_M: Final = 0.005
 SMALLEST_M: Final = 1e-4
 """A smaller oscillation of the hand counts as this: some counts of an encoder."""
+SMALLEST_N: Final = 0.02
+"""As much for a force: one count of the sensor."""
 RANGE_MARGIN_RAD: Final = 0.05
 """Closer to its range, a joint's limit and not the anti-windup would decide what happens."""
 
@@ -94,8 +96,10 @@ def _result(request: ExperimentRequest, scenario: Run, runs: dict[str, RunSeries
     band = stiction_band(scenario)
     metrics["stiction_band_rad"] = band.tolist()
     metrics["joints_not_saturated"] = [name for name, is_free in zip(robot.joint_names, free, strict=True) if is_free]
-    metrics["force_oscillation_none_over_qp"] = metrics["none_force_oscillation_n"] / metrics["qp_force_oscillation_n"]
-    margin = min(metrics[f"{method}_range_margin_min_rad"] for method in runs)
+    metrics["force_oscillation_none_over_qp"] = metrics["none_force_oscillation_n"] / max(
+        metrics["qp_force_oscillation_n"], SMALLEST_N
+    )
+    margin = float(np.min([metrics[f"{method}_range_margin_min_rad"] for method in runs]))
     bars = (
         Bar("qp_windup_over_limit_max", float(peak["qp"].max()), 1.0),
         Bar("qp_windup_over_bound_max", metrics["qp_windup_over_bound_max"], 1.0),

@@ -62,7 +62,7 @@ def _result(request: ExperimentRequest, scenario: Run, series: RunSeries, sticti
     start, _ = rest_position(series, elbow_from)
     led, _ = rest_position(series, lead_from)
     drift = float(_distances(hand, start, led).max())
-    in_time, _ = rest_position(series, lead_from + LEAD_S)
+    in_time, _ = rest_position(series, min(lead_from + LEAD_S, lead_to))
     moved = float(np.linalg.norm(hand[in_time] - hand[led]))
     release, _ = rest_position(series, lead_to)
     end, _ = rest_position(series, float(series.state.time_s[-1]))

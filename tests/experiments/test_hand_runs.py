@@ -23,7 +23,9 @@ from experiments.hand_runs import (
     perform,
     phase_named,
     settling_time,
+    stiction_band,
     stiction_force,
+    true_breakaway,
 )
 from plant_service.model import build, initial_position
 from schemas.errors import ConfigurationError
@@ -158,11 +160,13 @@ def test_what_an_experiment_needs_is_missed_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "event", "end_s"), [("arm9-null-space", "elbow", 13.5), ("arm9-dual-compliance", "hand", 12.7)]
+    ("scenario", "event", "end_s"), [("arm9-null-space", "elbow", 13.5), ("arm9-dual-compliance", "hand", 12.5)]
 )
 def test_time_is_left_after_the_last_event_has_let_go(scenario: str, event: str, end_s: float) -> None:
     events = ("hand", "elbow")
     assert end_of(event_of(load_run(scenario), event)) == pytest.approx(end_s)
+    fading = load_run(scenario, {f"plant.world.events.{event}.ramp_s": 0.2})
+    assert end_of(event_of(fading, event)) == pytest.approx(end_s + (0.2 if event == "hand" else 0.0))
     left_s = load_run(scenario).scenario.duration_s - end_s
     load(ExperimentRequest(0), scenario, events=events, after_s=left_s)
     with pytest.raises(UsageError, match=f"event '{event}' ends at {end_s:g} s .* --set duration_s=17.01 or more"):
@@ -181,3 +185,16 @@ def test_events_act_in_torque_mode() -> None:
     load(request, "arm9-null-space", events=("hand",), after_s=0.5)
     with pytest.raises(UsageError, match="'b' is in mode position from 6 s on"):
         load(request, "arm9-null-space", events=("hand",), after_s=0.6)
+
+
+def test_stiction_holds_a_joint_within_its_band_and_not_beyond() -> None:
+    """K_p M e = b at its edge; friction factors of the seed are in it."""
+    run = load_run("arm9-anti-windup", {"seed": 4, "plant.friction_error": 0.3})
+    band, breakaway = stiction_band(run), true_breakaway(run)
+    mass = RobotModel(run.robot).configure(initial_position(run.robot, run.scenario.plant), np.zeros(9)).mass
+    assert np.allclose(run.scenario.controller.hand.stiffness * np.diag(mass) * band, breakaway)
+    gears = np.array([joint.gear_ratio for joint in run.robot.description.joints])
+    factors = breakaway / (run.scenario.plant.friction.breakaway * gears)
+    assert np.allclose(factors, build(run.robot, run.scenario.plant, 4).friction_factors)
+    assert (np.abs(factors - 1.0) <= 0.3).all()
+    assert np.ptp(factors) > 0.1
