@@ -52,10 +52,12 @@ class HandControl:
         self._reference = WrenchReference.zero()
         self._period = description.period_s
 
-    def start(self) -> None:
-        """Begin anew, as after a change of mode."""
+    def start(self, wrench: Array | None = None) -> None:
+        """Begin anew, as after a change of mode, with the first Fʳ (6,) of the QP; None without a wrench task."""
         self._estimator.restart()
         self._reference = WrenchReference.zero()
+        if wrench is not None:
+            self._reference = WrenchReference(wrench, self._reference.rate)
         if self._switch is not None:
             self._switch.reset()
 
@@ -71,11 +73,6 @@ class HandControl:
         compliance = ALWAYS if self._switch is None else self._switch.update(measured.force_norm, elapsed_s)
         led = self._switch is not None and (compliance.active or compliance.released)
         return HandForces(measured, self._reference, compliance, led)
-
-    def begin(self, wrench: Array | None) -> None:
-        """Take the first Fʳ (6,) of the QP: at rest, Ḟʳ = 0."""
-        if wrench is not None:
-            self._reference = WrenchReference(wrench, self._reference.rate)
 
     def remember(self, wrench: Array | None, elapsed_s: float) -> None:
         """Take Fʳ (6,) that the QP found, for the next tick; None without a wrench task."""

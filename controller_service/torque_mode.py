@@ -44,8 +44,12 @@ class TorqueTick:
     """uʳ = M q̈ʳ + C q̇ + g − Jᵀ Fʳ."""
     law: LawTerms
     friction: Array
-    torque: Array
-    """The sum, before the last clip."""
+
+    @property
+    def torque(self) -> Array:
+        """The sum u, before the last clip."""
+        torque: Array = self.reference + self.law.integral + self.friction
+        return torque
 
 
 class TorqueMode:
@@ -93,19 +97,15 @@ class TorqueMode:
         if self._observer is not None and self._detector is not None:
             self._observer.reset(now)
             self._detector.reset()
-        if self._hand is not None:
-            self._hand.start()
         friction = self._compensate(now)
         targets = self._references.advance(time, now)
         motion = self._qp.solve(now, self._tasks.make(now, targets), friction, state.sequence)
         reference = self._reference(now, motion)
         if self._hand is not None:
-            self._hand.begin(motion.wrench)
+            self._hand.start(motion.wrench)
         self.law.reset(now, None if given is None else given - reference - friction)
         law = self.law.terms(now, None, 0.0)
-        return TorqueTick(
-            Sensed(None, None, None), motion, reference, law, friction, reference + law.integral + friction
-        )
+        return TorqueTick(Sensed(None, None, None), motion, reference, law, friction)
 
     def step(
         self, now: Configuration, time: PhaseTime, state: RobotState, acceleration: Array, elapsed_s: float
@@ -130,7 +130,7 @@ class TorqueMode:
         if self._hand is not None:
             self._hand.remember(motion.wrench, elapsed_s)
         reference = self._reference(now, motion)
-        return TorqueTick(sensed, motion, reference, law, friction, reference + law.integral + friction)
+        return TorqueTick(sensed, motion, reference, law, friction)
 
     def _refuse_low_thresholds(self, hidden: Array, thresholds: Array) -> None:
         worst = int(np.argmax(hidden / thresholds))

@@ -22,12 +22,12 @@ from deploy.series import Array, RunSeries
 from experiments.figures import anti_windup_figure, save
 from experiments.hand_runs import (
     WINDOW_S,
+    cycle_at,
     event_of,
     hand_error,
     load,
     oscillation,
     perform,
-    rest_position,
     settling_time,
     stiction_band,
     workplace,
@@ -119,9 +119,9 @@ def measure(series: RunSeries, push: tuple[float, float], limit: Array) -> dict[
     pushed = in_torque & (trace.time_s >= start_s)
     time_s, error = hand_error(series)
     distance = np.linalg.norm(error, axis=1)
-    before, _ = rest_position(series, start_s)
-    release, _ = rest_position(series, release_s)
-    end, _ = rest_position(series, float(series.state.time_s[-1]))
+    before = cycle_at(series, start_s)
+    release = cycle_at(series, release_s)
+    end = cycle_at(series, float(series.state.time_s[-1]))
     position = truth.position[before : end + 1]
     low = np.array([joint.position_min for joint in joints])
     high = np.array([joint.position_max for joint in joints])

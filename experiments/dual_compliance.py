@@ -15,16 +15,21 @@ import numpy as np
 from deploy.experiment import Bar, ExperimentRequest, ExperimentResult
 from deploy.series import Array, RunSeries
 from experiments.figures import dual_compliance_figure, save
-from experiments.hand_runs import load, perform, rest_position, stiction_force, workplace
-from experiments.null_space import elbow_displacement, spans
+from experiments.hand_runs import cycle_at, load, perform, stiction_force, workplace
+from experiments.null_space import (
+    DIRECTION,
+    ELBOW,
+    ELBOW_FORCE,
+    FORCE_OVER_STICTION,
+    elbow_displacement,
+    elbow_push,
+    spans,
+)
 from schemas.fingerprint import fingerprint
 from schemas.load import Run
 
 SCENARIO: Final = "arm9-dual-compliance"
-OWN_FIELDS: Final = ("plant.world.events.elbow.force_in_world",)
-ELBOW: Final = "elbow_pitch_link"
-DIRECTION: Final = (0.0, 1.0, 0.0)
-FORCE_OVER_STICTION: Final = 1.25
+OWN_FIELDS: Final = (ELBOW_FORCE,)
 LEAD_S: Final = 4.0
 SETTLE_S: Final = 2.0
 """After the hand was let go: how long its place is watched, at least."""
@@ -44,11 +49,9 @@ def run(request: ExperimentRequest) -> ExperimentResult:
     """
     scenario = load(request, SCENARIO, OWN_FIELDS, events=("elbow", "hand"), after_s=SETTLE_S)
     stiction = stiction_force(scenario, ELBOW, DIRECTION)
-    force = [FORCE_OVER_STICTION * stiction * component for component in DIRECTION]
     with workplace(request) as directory:
         request.progress(0.0, "pushed and led")
-        own = {"plant.world.events.elbow.force_in_world": force}
-        series = perform(request, SCENARIO, directory / "run", own)
+        series = perform(request, SCENARIO, directory / "run", elbow_push(stiction))
         if request.directory is not None:
             save(dual_compliance_figure(series, ELBOW), directory / "dual-compliance")
     return _result(request, scenario, series, stiction)
@@ -59,18 +62,18 @@ def _result(request: ExperimentRequest, scenario: Run, series: RunSeries, sticti
     hand = series.truth.hand
     elbow_from, elbow_to = pushes["elbow"]
     lead_from, lead_to = pushes["hand"]
-    start, _ = rest_position(series, elbow_from)
-    led, _ = rest_position(series, lead_from)
+    start = cycle_at(series, elbow_from)
+    led = cycle_at(series, lead_from)
     drift = float(_distances(hand, start, led).max())
-    in_time, _ = rest_position(series, min(lead_from + LEAD_S, lead_to))
+    in_time = cycle_at(series, min(lead_from + LEAD_S, lead_to))
     moved = float(np.linalg.norm(hand[in_time] - hand[led]))
-    release, _ = rest_position(series, lead_to)
-    end, _ = rest_position(series, float(series.state.time_s[-1]))
+    release = cycle_at(series, lead_to)
+    end = cycle_at(series, float(series.state.time_s[-1]))
     kept = float(_distances(hand, release, end).max())
     desired = series.trace.hand_desired[-1]
     active = series.trace.admittance
-    led_until = float(series.trace.time_s[active][-1]) if active.any() else float("nan")
     times = series.trace.time_s
+    led_until = float(times[active][-1]) if active.any() else float("nan")
     early = active & (times < lead_from)
     metrics: dict[str, Any] = {
         "gains": scenario.scenario.controller.gains or "own",

@@ -215,10 +215,9 @@ def settling_time(time_s: Array, distance: Array, release_s: float, band: float)
     return float(time_s[after][outside[-1] + 1] - release_s)
 
 
-def rest_position(series: RunSeries, time_s: float) -> tuple[int, float]:
-    """Index in the truth of the last cycle at or before a time, and its time [s]."""
-    index = int(np.searchsorted(series.truth.time_s, time_s, side="right")) - 1
-    return index, float(series.truth.time_s[index])
+def cycle_at(series: RunSeries, time_s: float) -> int:
+    """Index in the truth of the last cycle at or before a time."""
+    return int(np.searchsorted(series.truth.time_s, time_s, side="right")) - 1
 
 
 def true_breakaway(run: Run) -> Array:

@@ -25,10 +25,10 @@ from deploy.series import Array, RunSeries
 from experiments.figures import null_space_figure, save
 from experiments.hand_runs import (
     TIME_TOLERANCE_S,
+    cycle_at,
     hand_error,
     load,
     perform,
-    rest_position,
     stiction_force,
     workplace,
 )
@@ -38,7 +38,8 @@ from schemas.load import Run
 SCENARIO: Final = "arm9-null-space"
 VARIANTS: Final[dict[str, dict[str, Any]]] = {"with": {}, "without": {"controller.null_space": None}}
 PUSHES: Final = ("hand", "elbow")
-OWN_FIELDS: Final = ("plant.world.events.elbow.force_in_world",)
+ELBOW_FORCE: Final = "plant.world.events.elbow.force_in_world"
+OWN_FIELDS: Final = (ELBOW_FORCE,)
 OWN_WHOLE: Final = ("controller.null_space",)
 ELBOW: Final = "elbow_pitch_link"
 DIRECTION: Final = (0.0, 1.0, 0.0)
@@ -63,16 +64,19 @@ def run(request: ExperimentRequest) -> ExperimentResult:
     scenario = load(request, SCENARIO, OWN_FIELDS, own_whole=OWN_WHOLE, events=PUSHES, after_s=SETTLE_S + LAST_S)
     _check(scenario)
     stiction = stiction_force(scenario, ELBOW, DIRECTION)
-    force = [FORCE_OVER_STICTION * stiction * component for component in DIRECTION]
     with workplace(request) as directory:
         runs: dict[str, RunSeries] = {}
         for number, (name, overrides) in enumerate(VARIANTS.items()):
             request.progress(number / len(VARIANTS), name)
-            own = {"plant.world.events.elbow.force_in_world": force, **overrides}
-            runs[name] = perform(request, SCENARIO, directory / name, own)
+            runs[name] = perform(request, SCENARIO, directory / name, {**elbow_push(stiction), **overrides})
         if request.directory is not None:
             save(null_space_figure(runs, ELBOW), directory / "null-space")
     return _result(request, scenario, runs, stiction)
+
+
+def elbow_push(stiction: float) -> dict[str, Any]:
+    """Give the override that pushes the elbow by `FORCE_OVER_STICTION` times the stiction force [N]."""
+    return {ELBOW_FORCE: [FORCE_OVER_STICTION * stiction * component for component in DIRECTION]}
 
 
 def spans(scenario: Run) -> dict[str, tuple[float, float]]:
@@ -129,8 +133,8 @@ def _result(request: ExperimentRequest, scenario: Run, runs: dict[str, RunSeries
 
 def elbow_displacement(series: RunSeries, push: tuple[float, float]) -> float:
     """Farthest that the elbow is from where it was at a push's start, up to its end [m]."""
-    first, _ = rest_position(series, push[0])
-    last, _ = rest_position(series, push[1])
+    first = cycle_at(series, push[0])
+    last = cycle_at(series, push[1])
     elbow = series.truth.frames[ELBOW]
     return float(np.linalg.norm(elbow[first : last + 1] - elbow[first], axis=1).max())
 

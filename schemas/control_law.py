@@ -108,7 +108,7 @@ class WrenchTask(Model):
     torque_in_world: Vector3 = (0.0, 0.0, 0.0)
     """[N·m] at the hand frame's origin."""
     force_limit: PositiveFloat = 200.0
-    """Bound [N] on each component of F^r."""
+    """Largest component [N] that F^d may have; Fʳ lies between 0 and F^d."""
     torque_limit: PositiveFloat = 30.0
     """[N·m]."""
 

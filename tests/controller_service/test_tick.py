@@ -51,7 +51,7 @@ def tick(arm: Robot) -> Tick:
     )
     law = LawTerms(ZERO, ZERO, ZERO, ZERO, ZERO, 0.0)
     motion = ReferenceMotion(ZERO, None, SOLVED)
-    terms = TorqueTick(Sensed(ZERO, QUIET, forces), motion, ZERO, law, ZERO, ZERO)
+    terms = TorqueTick(Sensed(ZERO, QUIET, forces), motion, ZERO, law, ZERO)
     return Tick(ControlMode.TORQUE, now, motion, ZERO, ZERO, None, ZERO, terms)
 
 
