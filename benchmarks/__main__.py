@@ -16,7 +16,15 @@ from rich.table import Table
 from benchmarks.anti_windup import anti_windup
 from benchmarks.kernel_can import kernel_ports
 from benchmarks.measure import Figures
-from benchmarks.stages import EVERYTHING, bus_round_trip, one_process, separate_processes, zenoh_round_trip
+from benchmarks.motor_fit import motor_fit
+from benchmarks.stages import (
+    EVERYTHING,
+    POSITION_INTERFACE,
+    bus_round_trip,
+    one_process,
+    separate_processes,
+    zenoh_round_trip,
+)
 from benchmarks.yardstick import yardsticks
 from schemas.load import load_run
 
@@ -37,11 +45,14 @@ def main() -> int:
         one = one_process(load_run(chosen.scenario), chosen.cycles)
     with console.status("one process, all parts of the controller"):
         everything = one_process(load_run(*EVERYTHING), chosen.cycles)
+    with console.status("one process, torque control through the position interface"):
+        interface = one_process(load_run(*POSITION_INTERFACE), chosen.cycles)
     stages = list(one.stages)
     with console.status("bus"):
         stages.append(bus_round_trip(chosen.cycles).figures())
     stages += [timing.figures() for timing in kernel_ports("vcan0", chosen.cycles)]
     stages += [timing.figures() for timing in anti_windup(chosen.cycles)]
+    stages.append(motor_fit().figures())
     with console.status("Zenoh"):
         stages.append(zenoh_round_trip(chosen.cycles).figures())
     with console.status("separate processes"):
@@ -51,6 +62,7 @@ def main() -> int:
     out.print(_table("this machine, now", machine))
     out.print(_table(f"{chosen.scenario}: stages of the cycle, wall clock", stages))
     out.print(_table(f"{EVERYTHING[0]} with all parts of the controller: stages of the cycle", everything.stages))
+    out.print(_table(f"{POSITION_INTERFACE[0]}, the position interface: stages of the cycle", interface.stages))
     out.print(_table("separate processes, of each service's own cycle", separate.stages))
     out.print(_table("whole cycle, SYNC to SYNC", [one.whole, separate.whole]))
     print(f"real-time factor: one process {one.real_time_factor:.2f}, separate {separate.real_time_factor:.2f}")
@@ -64,6 +76,7 @@ def main() -> int:
         "stages": [each.as_json() for each in stages],
         "one_process": one.as_json(),
         "everything": everything.as_json(),
+        "position_interface": interface.as_json(),
         "separate_processes": separate.as_json(),
     }
     chosen.out.parent.mkdir(parents=True, exist_ok=True)

@@ -49,6 +49,8 @@ EVERYTHING = (
     },
 )
 """Scenario and overrides of a run with all parts of the controller on."""
+POSITION_INTERFACE = ("leg6-stairs", {"controller.phases.0.duration_s": 0.1})
+"""Scenario and overrides of a run under torque control through the position interface."""
 MESSAGE = b"x" * 2048
 """About the size of arm9's state as JSON."""
 
@@ -78,6 +80,8 @@ def one_process(run: Run, cycles: int) -> LoopFigures:
         Stopwatch("QP within the tick", loop.controller._qp, "solve"),
         Stopwatch("limits and RPDOs", loop.master, "apply"),
     ]
+    if loop.controller._interface is not None:
+        watches.append(Stopwatch("estimation within the tick", loop.controller._interface, "sense"))
     for _ in range(WARM_UP):
         loop.step()
     for watch in watches:

@@ -3,42 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import replace
 from enum import Enum, auto
 
 import numpy as np
 
 from controller_service.acceleration_qp import AccelerationQp, ReferenceMotion
+from controller_service.acceptance import GivenTorque, StateOrder
+from controller_service.braking import Braking
 from controller_service.collision import CollisionModel
 from controller_service.constraints import JointLimits
-from controller_service.errors import ControllerError, StateError
+from controller_service.errors import ControllerError
 from controller_service.estimation import Estimate, VelocityEstimator
 from controller_service.hand_control import HandControl
 from controller_service.law import inverse_dynamics
 from controller_service.model import Array, Configuration, RobotModel
+from controller_service.position_interface import Fade, PositionInterface
 from controller_service.qp import QpSolution
 from controller_service.schedule import PhaseTime, References, Schedule
 from controller_service.task_set import TaskSet
-from controller_service.tick import EventLog, HandTrace, Tick, make_trace
+from controller_service.tick import EventLog, HandTrace, Tick, make_command, make_trace
 from controller_service.torque_mode import TorqueMode, TorqueTick
 from schemas.base import ControlMode, Vector
+from schemas.controller import Phase
 from schemas.errors import ConfigurationError
 from schemas.load import Run
 from schemas.messages import ControllerTrace, Event, HalStatus, JointCommand, RobotState
+from schemas.robot import RobotDescription
 
-TORQUE_SAMPLES = 8
-"""Measured motor torques averaged for the transition, at rest."""
-REST_SPEED = 0.02
-"""[rad/s] Faster than this on any joint, the transition takes the last torque alone."""
 CLIP_SHARE = 1e-3
 """Share of the torque limit beyond which a clipped torque is reported."""
-STOP_S = 0.1
-"""Time from the failure of torque mode to the controller's end."""
-STOP_DECAY_S = 0.025
-"""Time constant with which the last torque goes over into a braking one meanwhile."""
-STOP_DAMPING = 10.0
-"""[1/s] of that braking: with the joints' inertia it stops them in some 100 ms where the torque limits allow it."""
 
 
 class Stage(Enum):
@@ -52,6 +46,8 @@ class Stage(Enum):
     """First tick of the two-step transition: the target is held, the QP has the measured configuration."""
     TORQUE = auto()
     """u = uʳ + L s at the measured configuration."""
+    INTERFACE = auto()
+    """Torque control through the position interface: the command is q + Δq."""
     STOPPING = auto()
     """Torque mode cannot go on: the last torque falls to what carries the robot, then the controller gives up."""
 
@@ -86,7 +82,10 @@ class Controller:
         self._period = description.period_s
         self._config = config
         self._frame = description.hand_frame
-        self._model = RobotModel(run.robot, (self._frame,) if self._frame else ())
+        frames = [] if self._frame is None else [self._frame]
+        if config.position_torque is not None:
+            frames += sensor_frames(description, config.position_torque.sensor)
+        self._model = RobotModel(run.robot, tuple(dict.fromkeys(frames)))
         self._n = self._model.n
         self._estimator = VelocityEstimator(self._period, config.velocity_cutoff_hz)
         self._schedule = Schedule(description, config.phases)
@@ -104,15 +103,21 @@ class Controller:
                 " null space; leave it out, or choose another controller.hand_task"
             )
         self._torque_mode = TorqueMode(run, self._qp, self._references, self._tasks, hand)
+        self._interface = None
+        self._fade = Fade(0.0)
+        """What the command of the position interface was away from the posture, after it."""
+        if config.position_torque is not None:
+            self._interface = PositionInterface(run, config.position_torque, self._model, self._qp, self._tasks)
+            self._fade = Fade(config.position_torque.start_s)
         contacts = config.observer is not None and config.observer.reaction != "none"
         self._log = EventLog(description.joint_names, contacts=contacts)
         servo = all(joint.drive.kind == "servo" for joint in description.joints)
         self._still_mode = ControlMode.SERVO if servo else ControlMode.POSITION
         self._torque_limits: Vector = tuple(self._qp.limits.torque.tolist())
         self._reported_torque = (1.0 + CLIP_SHARE) * self._qp.limits.torque
-        self._torques: deque[Vector] = deque(maxlen=TORQUE_SAMPLES)
+        self._torques = GivenTorque()
         self._stage = Stage.HOLD
-        self._sequence: int | None = None
+        self._order = StateOrder(description.joint_names)
         self._position = np.zeros(self._n)
         """Open-loop position reference [rad], at the current state's time."""
         self._velocity = np.zeros(self._n)
@@ -120,8 +125,11 @@ class Controller:
         """q̈ʳ of the last tick, held since."""
         self._torque = np.zeros(self._n)
         """Of the last tick in torque mode."""
-        self._failure: tuple[ControllerError, float] | None = None
-        """Why torque mode ends, and for how long it has been ending [s]."""
+        self._given = np.zeros(self._n)
+        """Last command of the position interface [rad]."""
+        self._waiting = False
+        """Torque control through it is asked for, but its sensors are not ready."""
+        self._braking = Braking(self._qp.limits.torque)
 
     def drain_events(self) -> list[Event]:
         """Take the events since the last call."""
@@ -142,12 +150,12 @@ class Controller:
                 silent sensor: in torque mode these come after the robot was brought to rest.
 
         """
-        measured, cycles = self._accept(state)
+        measured, cycles = self._order.accept(state)
         estimate = self._estimator.estimate(measured, cycles)
-        if state.motor_torque_measured is not None:
-            self._torques.append(state.motor_torque_measured)
+        self._torques.note(state)
+        sensed = None if self._interface is None else self._interface.sense(state, measured, cycles)
         time = self._schedule.at(state.sequence)
-        before, self._stage = self._stage, self._next_stage(state, time.phase.mode)
+        before, self._stage = self._stage, self._next_stage(state, time.phase)
         elapsed_s = cycles * self._period
         if self._stage is Stage.HOLD:
             tick = self._hold(state, estimate)
@@ -155,68 +163,115 @@ class Controller:
             tick = self._follow(state, time, estimate, elapsed_s, before)
         elif self._stage is Stage.CAPTURE:
             tick = self._capture(state, time, estimate, elapsed_s, before)
+        elif self._stage is Stage.INTERFACE:
+            tick = self._give_offset(state, time, estimate, cycles, before)
         else:
             tick = self._drive(state, time, estimate, elapsed_s, before)
         self._acceleration = tick.motion.acceleration
         self._log.note(state, tick)
+        if time.phase.torque_control and self._stage is Stage.POSITION and not self._waiting:
+            text = f"{time.phase.name}: not every sensor has been read for a whole window; position control goes on"
+            self._log.tell(state, "torque_control_waits", text, "warning")
+        self._waiting = time.phase.torque_control and self._stage is Stage.POSITION
         if (phase := self._references.take_dropped_path()) is not None:
-            text = f"{phase}: too little time is left for its path; the hand holds"
+            text = f"{phase}: too little time is left for its path; the robot holds its place"
             self._log.tell(state, "path_dropped", text, "warning")
-        return self._command(state, tick), make_trace(state, time, estimate, tick, self._hand_trace(estimate, tick))
+        if self._interface is not None and self._stage is not Stage.INTERFACE:
+            self._interface.watch(self._references.posture_target, tick.now, state, cycles)
+        hand = self._hand_trace(estimate, tick)
+        delay_s = 0.0 if self._interface is None else self._interface.delay_s
+        told = sensed if self._interface is not None and self._interface.ready else None
+        return make_command(state, tick, self._session, self._model.names, self._torque_limits), make_trace(
+            state, time, estimate, tick, hand, told, delay_s
+        )
 
-    def _accept(self, state: RobotState) -> tuple[Array, int]:
-        if len(state.position_measured) != self._n:
-            raise StateError(
-                f"state {state.sequence} has {len(state.position_measured)} positions, the robot has {self._n} joints:"
-                " is another robot running under the same namespace?"
-            )
-        measured = np.array(state.position_measured)
-        if not all(map(math.isfinite, state.position_measured)):
-            worst = int(np.argmin(np.isfinite(measured)))
-            raise StateError(f"state {state.sequence}: position of {self._model.names[worst]} is {measured[worst]}")
-        cycles = 1 if self._sequence is None else state.sequence - self._sequence
-        if cycles < 1:
-            raise StateError(
-                f"state {state.sequence} came after state {self._sequence}; states must be in order, each once."
-                " Is there a second HAL under the same namespace?"
-            )
-        self._sequence = state.sequence
-        return measured, cycles
-
-    def _next_stage(self, state: RobotState, wanted: ControlMode) -> Stage:
+    def _next_stage(self, state: RobotState, phase: Phase) -> Stage:
         if state.status is not HalStatus.ACTIVE:
             return Stage.HOLD
-        if self._failure is not None:
+        if self._braking.error is not None:
             return Stage.STOPPING
-        if wanted is not ControlMode.TORQUE:
+        if phase.torque_control and self._interface is not None:
+            running = self._stage is Stage.INTERFACE or self._interface.ready
+            return Stage.INTERFACE if running else Stage.POSITION
+        if phase.mode is not ControlMode.TORQUE:
             return Stage.POSITION
         return Stage.TORQUE if self._stage in (Stage.CAPTURE, Stage.TORQUE) else Stage.CAPTURE
 
     def _hold(self, state: RobotState, estimate: Estimate) -> Tick:
-        if self._failure is not None:
-            raise self._failure[0]  # the HAL holds the robot: nothing is left to bring to rest
+        if self._braking.error is not None:
+            raise self._braking.error  # the HAL holds the robot: nothing is left to bring to rest
         now = self._model.configure(estimate.position, estimate.velocity)
         self._position, self._velocity = _firmware_target(state), np.zeros(self._n)
+        self._fade.stop()
         self._references.forget()
-        self._torques.clear()
+        self._torques.forget()
         return self._position_tick(self._still_mode, now, self._unsolved("holding"), self._position)
 
     def _follow(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
         """Position mode: (q_ref, q̇_ref) is the QP's configuration; the command is q_ref one period on."""
         if before is Stage.POSITION:
             self._position, self._velocity = self._ahead(elapsed_s)
+        elif before is Stage.INTERFACE:
+            self._leave_interface(elapsed_s)
         else:
             self._references.forget()
             if before is Stage.HOLD:
                 self._position = _firmware_target(state)
             elif before is Stage.TORQUE:
                 self._position, self._velocity = estimate.position, np.zeros(self._n)
-                self._torques.clear()
+                self._torques.forget()
         now = self._model.configure(self._position, self._velocity)
         motion = self._plan(now, time, state)
         self._acceleration = motion.acceleration
         target = estimate.position if before is Stage.TORQUE else self._ahead(self._period)[0]
-        return self._position_tick(time.phase.mode, now, motion, target)
+        return self._position_tick(time.phase.mode, now, motion, self._fade.advance(target, elapsed_s))
+
+    def _give_offset(
+        self,
+        state: RobotState,
+        time: PhaseTime,
+        estimate: Estimate,
+        cycles: int,
+        before: Stage,
+    ) -> Tick:
+        """Torque control through the position interface: the first command is what position control would send."""
+        assert self._interface is not None
+        if before not in (Stage.POSITION, Stage.INTERFACE):
+            self._references.forget()
+            if before is Stage.HOLD:
+                self._position = _firmware_target(state)
+            elif before is Stage.TORQUE:
+                self._position = estimate.position
+                self._torques.forget()
+        now = self._model.configure(estimate.position, self._interface.velocity())
+        targets = self._references.advance(time, now)
+        if before is Stage.INTERFACE:
+            given = self._interface.step(now, time, targets, state, cycles, estimate.velocity)
+        else:
+            position = self._position
+            if before is Stage.POSITION:
+                position = self._fade.advance(self._ahead((cycles + 1) * self._period)[0], cycles * self._period)
+            given = self._interface.start(position, now, time, targets, state, cycles)
+        self._position, self._velocity = targets.posture.position, targets.posture.velocity
+        self._given = given.command
+        motion, posture = given.motion, targets.posture
+        return Tick(
+            ControlMode.POSITION,
+            now,
+            motion,
+            posture.velocity,
+            posture.position,
+            given.command,
+            given.torque,
+            None,
+            given,
+            posture,
+        )
+
+    def _leave_interface(self, elapsed_s: float) -> None:
+        """Go on with the posture that was desired; what the command was away from it fades."""
+        self._position, self._velocity = self._ahead(elapsed_s)
+        self._fade.start(self._given - self._position)
 
     def _capture(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
         """First step of the transition: the target stands still, QP and tasks get the measured configuration."""
@@ -234,13 +289,13 @@ class Controller:
     def _drive(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
         """Torque mode, (3) or (21), within the torque limits; or its end."""
         now = self._model.configure(estimate.position, estimate.velocity)
-        if self._failure is not None:
+        if self._braking.error is not None:
             return self._stop(now, estimate, elapsed_s)
         if before is not Stage.TORQUE:
             # The drives are still in position mode and hold the robot, whatever is raised here
-            given = self._torque_given(state, estimate) if self._config.initialize_integral else None
+            given = self._torques.torque(state, estimate) if self._config.initialize_integral else None
             terms = self._torque_mode.start(now, time, state, given)
-            self._torques.clear()
+            self._torques.forget()
             self._warn_of_friction(state, now)
             return self._torque_tick(now, estimate, terms, state)
         try:
@@ -270,21 +325,12 @@ class Controller:
             self._log.tell(state, "friction_compensation_steep", text, "warning")
 
     def _fail(self, state: RobotState, error: ControllerError) -> None:
-        self._failure = (error, 0.0)
+        self._braking.begin(error)
         self._stage = Stage.STOPPING
         self._log.tell(state, "torque_mode_failed", f"{error} The robot is brought to rest.", "error")
 
     def _stop(self, now: Configuration, estimate: Estimate, elapsed_s: float) -> Tick:
-        """τ ← τ_b + (τ − τ_b) e^(−t/`STOP_DECAY_S`) with τ_b = g − `STOP_DAMPING` diag(M) q̇."""
-        assert self._failure is not None
-        error, since_s = self._failure
-        if since_s >= STOP_S:
-            raise error
-        self._failure = (error, since_s + elapsed_s)
-        braking = now.gravity - STOP_DAMPING * now.mass.diagonal() * now.velocity
-        torque = braking + math.exp(-elapsed_s / STOP_DECAY_S) * (self._torque - braking)
-        limits = self._qp.limits.torque
-        self._torque = np.minimum(np.maximum(torque, -limits), limits)
+        self._torque = self._braking.torque(self._torque, now, elapsed_s)
         reference = self._torque_mode.law.velocity_reference
         motion = self._unsolved("stopping")
         return Tick(ControlMode.TORQUE, now, motion, reference, estimate.position, None, self._torque, None)
@@ -292,18 +338,6 @@ class Controller:
     def _unsolved(self, why: str) -> ReferenceMotion:
         zero = np.zeros(self._n)
         return ReferenceMotion(zero, None, QpSolution(zero, np.zeros(0), 0, f"not solved: {why}", 0.0, 0.0))
-
-    def _torque_given(self, state: RobotState, estimate: Estimate) -> Array:
-        """Return what the position loop was giving, from the motor currents (n,) [N·m]."""
-        if state.motor_torque_measured is None:
-            raise StateError(
-                f"state {state.sequence}: the drives report no motor torque, which torque mode starts from."
-                " Use position mode, or set controller.initialize_integral to false."
-            )
-        if np.abs(estimate.velocity).max() > REST_SPEED:
-            return np.array(self._torques[-1])
-        mean: Array = np.mean(self._torques, axis=0)
-        return mean
 
     def _ahead(self, time_s: float) -> tuple[Array, Array]:
         """Open-loop reference after q̈ʳ was held for a time: exact double integration."""
@@ -314,24 +348,6 @@ class Controller:
         torque = inverse_dynamics(now, motion.acceleration)
         return Tick(mode, now, motion, self._velocity, self._position, target, torque, None)
 
-    def _command(self, state: RobotState, tick: Tick) -> JointCommand:
-        value = tick.torque if tick.position_command is None else tick.position_command
-        vector = tuple(value.tolist())
-        if not all(map(math.isfinite, vector)):
-            worst = int(np.argmin(np.isfinite(value)))
-            raise ControllerError(
-                f"state {state.sequence}: the {tick.mode.value} command of {self._model.names[worst]} is {value[worst]}"
-            )
-        return JointCommand(
-            session=self._session,
-            sequence=state.sequence,
-            time_ns=state.time_ns,
-            mode=tick.mode,
-            position=None if tick.position_command is None else vector,
-            torque=vector if tick.position_command is None else None,
-            torque_limit=self._torque_limits if tick.mode is ControlMode.SERVO else None,
-        )
-
     def _hand_trace(self, estimate: Estimate, tick: Tick) -> HandTrace:
         """Desired and estimated pose of the hand; in position mode the configuration is the reference's."""
         if self._frame is None:
@@ -341,6 +357,11 @@ class Controller:
         if self._stage is Stage.POSITION:
             pose = self._model.pose(estimate.position, self._frame)
         return HandTrace(self._references.hand_target, pose)
+
+
+def sensor_frames(description: RobotDescription, sensor: str | None) -> list[str]:
+    """Frame of a force/torque sensor, if there is one."""
+    return [each.frame for each in description.force_torque_sensors if each.name == sensor]
 
 
 def _firmware_target(state: RobotState) -> Array:

@@ -1,4 +1,4 @@
-"""Desired motions as functions of time: minimum-jerk posture changes and closed paths of the hand."""
+"""Desired motions as functions of time: of the joints (minimum jerk, splines, sines) and closed paths of the hand."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from controller_service.model import Array
 from controller_service.tasks import PoseTarget, PostureTarget
-from schemas.controller import HandPath
+from schemas.controller import HandPath, JointPath, JointSines
 
 AXES = {"xy": (0, 1), "yz": (1, 2), "xz": (0, 2)}
 """World axes of a path's plane."""
@@ -38,6 +39,83 @@ class PostureMotion:
         value, rate, acceleration = minimum_jerk(time_s, self.duration_s)
         change = self.end - self.start
         return PostureTarget(self.start + value * change, rate * change, acceleration * change)
+
+
+class JointReference(Protocol):
+    """What the joints are to do over a phase; at rest before its start and after its end."""
+
+    def at(self, time_s: float) -> PostureTarget:
+        """q^d, q̇^d, q̈^d, each (n,), at a time since the phase's start."""
+        ...
+
+
+class JointSpline:
+    """A spline of fifth degree through postures, with zero velocity and acceleration at both ends.
+
+    Args:
+        start: posture (n,) [rad] at time 0.
+        path: points after it.
+        names: of the joints.
+
+    """
+
+    def __init__(self, start: Array, path: JointPath, names: tuple[str, ...]) -> None:
+        postures, times = [start], [0.0]
+        for point in path.points:
+            posture = postures[-1].copy()
+            for name, angle in point.posture.items():
+                posture[names.index(name)] = angle
+            postures.append(posture)
+            times.append(point.time_s)
+        still = np.zeros((2, len(start)))
+        ends = [(order, row) for order, row in enumerate(still, 1)]
+        self._spline = make_interp_spline(times, np.array(postures), k=5, bc_type=(ends, ends))
+        self._end_s = times[-1]
+        self._last = postures[-1]
+
+    def at(self, time_s: float) -> PostureTarget:
+        """q^d, q̇^d, q̈^d."""
+        if not 0.0 <= time_s < self._end_s:
+            still = np.zeros_like(self._last)
+            return PostureTarget(self._last if time_s > 0.0 else self._spline(0.0), still, still)
+        return PostureTarget(*(self._spline(time_s, order) for order in range(3)))
+
+
+class JointSineMotion:
+    """q^d = q_0 + w(t) (a₀ + a t) sin(2π f t), section 3.4.2 of [Del Prete 2016].
+
+    w fades in and out along minimum-jerk curves, so that the motion begins and ends at rest.
+
+    Args:
+        start: posture q_0 (n,) [rad].
+        sines: of some joints.
+        names: of all.
+        duration_s: of the phase.
+
+    """
+
+    def __init__(self, start: Array, sines: JointSines, names: tuple[str, ...], duration_s: float) -> None:
+        self._start, self._fade, self._duration = start, sines.fade_s, duration_s
+        self._amplitude, self._growth, self._rate = (np.zeros(len(names)) for _ in range(3))
+        for name, sine in sines.joints.items():
+            index = names.index(name)
+            self._amplitude[index], self._growth[index] = sine.amplitude, sine.growth
+            self._rate[index] = 2.0 * math.pi * sine.frequency_hz
+
+    def at(self, time_s: float) -> PostureTarget:
+        """q^d, q̇^d, q̈^d by the product rule."""
+        rising, falling = minimum_jerk(time_s, self._fade), minimum_jerk(self._duration - time_s, self._fade)
+        w = rising[0] * falling[0]
+        dw = rising[1] * falling[0] - rising[0] * falling[1]
+        ddw = rising[2] * falling[0] - 2.0 * rising[1] * falling[1] + rising[0] * falling[2]
+        size = self._amplitude + self._growth * time_s
+        a, da, dda = w * size, dw * size + w * self._growth, ddw * size + 2.0 * dw * self._growth
+        sine, cosine, rate = np.sin(self._rate * time_s), np.cos(self._rate * time_s), self._rate
+        return PostureTarget(
+            self._start + a * sine,
+            da * sine + a * rate * cosine,
+            dda * sine + 2.0 * da * rate * cosine - a * rate * rate * sine,
+        )
 
 
 class HandMotion(Protocol):

@@ -6,8 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller_service.model import Configuration
-from controller_service.reference import HandHold, HandMotion, PostureMotion, hand_motion
+from controller_service.model import Array, Configuration
+from controller_service.reference import (
+    HandHold,
+    HandMotion,
+    JointReference,
+    JointSineMotion,
+    JointSpline,
+    PostureMotion,
+    hand_motion,
+)
 from controller_service.tasks import PoseTarget, PostureTarget
 from schemas.base import ControlMode
 from schemas.controller import Phase
@@ -61,6 +69,21 @@ class Schedule:
                         f"controller.phases.{index}: hand_path takes {path_s:g} s (lap_s × laps), longer than the"
                         f" phase's duration_s {phase.duration_s:g}"
                     )
+            if phase.joint_path is not None and (end_s := phase.joint_path.points[-1].time_s) > phase.duration_s + 1e-9:
+                raise ConfigurationError(
+                    f"controller.phases.{index}.joint_path: its last point is at {end_s:g} s, after the phase's"
+                    f" duration_s {phase.duration_s:g}"
+                )
+            if phase.joint_sines is not None and 2.0 * phase.joint_sines.fade_s > phase.duration_s + 1e-9:
+                raise ConfigurationError(
+                    f"controller.phases.{index}.joint_sines: two ramps of fade_s {phase.joint_sines.fade_s:g} s do not"
+                    f" fit into the phase's duration_s {phase.duration_s:g}"
+                )
+            if phase.wrench is not None and 2.0 * phase.wrench.ramp_s > phase.duration_s + 1e-9:
+                raise ConfigurationError(
+                    f"controller.phases.{index}.wrench: two ramps of ramp_s {phase.wrench.ramp_s:g} s do not fit into"
+                    f" the phase's duration_s {phase.duration_s:g}"
+                )
 
     def at(self, sequence: int) -> PhaseTime:
         """Find the phase of a sequence number."""
@@ -92,7 +115,8 @@ class References:
     """Desired posture and hand pose, kept without a jump from phase to phase.
 
     The posture task always runs. The hand task runs in phases with a path and in phases that ask for nothing (which
-    hold posture and hand); a phase that only moves the posture leaves the hand free.
+    hold posture and hand); a phase that only moves the joints leaves the hand free, as does torque control through the
+    position interface.
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -102,9 +126,9 @@ class References:
         self._origin = 0.0
         self._end = 0.0
         """When, after the origin, the entered phase is over and its motions have ended."""
-        self._posture: PostureMotion | None = None
+        self._posture: JointReference | None = None
         self._hand: HandMotion | None = None
-        self._dropped_path: str | None = None
+        self._dropped: str | None = None
         self.posture_target: PostureTarget | None = None
         self.hand_target: PoseTarget | None = None
         """None while the hand task does not run."""
@@ -117,7 +141,7 @@ class References:
 
     def take_dropped_path(self) -> str | None:
         """Name the phase whose path was left out, for want of time after a hold or a contact; once."""
-        dropped, self._dropped_path = self._dropped_path, None
+        dropped, self._dropped = self._dropped, None
         return dropped
 
     def advance(self, time: PhaseTime, now: Configuration) -> Targets:
@@ -149,18 +173,33 @@ class References:
         start = now.position
         if self._posture is not None and self.posture_target is not None:
             start = self._posture.at(self._end).position
-        end, duration = start.copy(), phase.duration_s
-        if time.left_s >= SHORTEST_SHARE * phase.duration_s:
-            end[[self._names.index(name) for name in phase.posture]] = list(phase.posture.values())
-            duration = time.left_s
-        self._posture = PostureMotion(start, end, duration)
+        self._posture = self._joint_motion(time, start)
         before = None if self._hand is None or self.hand_target is None else self._hand.at(self._end)
         self._hand = self.hand_target = None
-        if self._frame is not None and (phase.hand_path is not None or not phase.posture):
+        moves_joints = phase.posture or phase.joint_path or phase.joint_sines or phase.torque_control
+        if self._frame is not None and (phase.hand_path is not None or not moves_joints):
             path = phase.hand_path
             if path is not None and path.lap_s * path.laps > time.left_s * (1.0 + 1e-9):
-                self._dropped_path, path = time.phase.name, None
+                self._dropped, path = time.phase.name, None
             frame = now.frames[self._frame]
             pose = (frame.position, frame.rotation) if before is None else (before.position, before.rotation)
             self._hand = hand_motion(*pose, path)
         self._index, self._origin, self._end = time.index, time.since_start_s, time.left_s
+
+    def _joint_motion(self, time: PhaseTime, start: Array) -> JointReference:
+        """Make the joints' motion of a phase; one that is entered late keeps its place where there is no time left."""
+        phase = time.phase
+        late = time.left_s < (1.0 - 1e-9) * phase.duration_s
+        if phase.joint_path is not None or phase.joint_sines is not None:
+            if late:
+                self._dropped = phase.name
+                return PostureMotion(start, start, phase.duration_s)
+            if phase.joint_path is not None:
+                return JointSpline(start, phase.joint_path, self._names)
+            assert phase.joint_sines is not None
+            return JointSineMotion(start, phase.joint_sines, self._names, phase.duration_s)
+        end, duration = start.copy(), phase.duration_s
+        if time.left_s >= SHORTEST_SHARE * phase.duration_s:
+            end[[self._names.index(name) for name in phase.posture]] = list(phase.posture.values())
+            duration = time.left_s
+        return PostureMotion(start, end, duration)

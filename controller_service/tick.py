@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import pinocchio as pin
 
 from controller_service.acceleration_qp import ReferenceMotion
+from controller_service.errors import ControllerError
 from controller_service.estimation import Estimate
 from controller_service.model import Array, Configuration
+from controller_service.motion_sensing import MotionEstimate
+from controller_service.position_interface import InterfaceTick
 from controller_service.schedule import PhaseTime
-from controller_service.tasks import PoseTarget
+from controller_service.tasks import PoseTarget, PostureTarget
 from controller_service.torque_mode import TorqueTick
 from schemas.base import ControlMode, Vector
-from schemas.messages import ControllerTrace, Event, PoseSample, RobotState
+from schemas.messages import ControllerTrace, Event, JointCommand, MotionTrace, OffsetTrace, PoseSample, RobotState
 
 SERVICE = "controller"
 REPORT_AGAIN_S = 1.0
@@ -36,6 +41,10 @@ class Tick:
     """u within its limits, or the computed torque in the position modes."""
     terms: TorqueTick | None
     """None outside torque mode."""
+    interface: InterfaceTick | None = None
+    """Under torque control through the position interface."""
+    posture: PostureTarget | None = None
+    """What that follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +105,8 @@ class EventLog:
             if told_ns is None or state.time_ns - told_ns >= REPORT_AGAIN_S * 1e9:
                 self._relaxed[name] = state.time_ns
                 self.tell(state, "constraint_relaxed", f"{name}: cannot be kept with the torque there is", "warning")
+        if tick.interface is not None:
+            self._note_limits(state, tick.interface.limited)
         if tick.terms is None:
             return
         contact, hand = tick.terms.sensed.contact if self._contacts else None, tick.terms.sensed.hand
@@ -109,9 +120,51 @@ class EventLog:
         if hand is not None and hand.compliance.released:
             self.tell(state, "admittance_off", "the hand stays where it was released")
 
+    def _note_limits(self, state: RobotState, limited: tuple[str, ...]) -> None:
+        for name in limited:
+            told_ns = self._relaxed.get(name)
+            if told_ns is None or state.time_ns - told_ns >= REPORT_AGAIN_S * 1e9:
+                self._relaxed[name] = state.time_ns
+                self.tell(state, "command_limited", f"{name}: torque control asks for more", "warning")
 
-def make_trace(state: RobotState, time: PhaseTime, estimate: Estimate, tick: Tick, hand: HandTrace) -> ControllerTrace:
-    """Report every term of a tick."""
+
+def make_command(
+    state: RobotState, tick: Tick, session: str, names: tuple[str, ...], torque_limit: Vector
+) -> JointCommand:
+    """Answer a state by what a tick decided.
+
+    Raises:
+        ControllerError: a command that is not finite.
+
+    """
+    value = tick.torque if tick.position_command is None else tick.position_command
+    vector = _vector(value)
+    if not all(map(math.isfinite, vector)):
+        worst = int(np.argmin(np.isfinite(value)))
+        raise ControllerError(
+            f"state {state.sequence}: the {tick.mode.value} command of {names[worst]} is {value[worst]}"
+        )
+    return JointCommand(
+        session=session,
+        sequence=state.sequence,
+        time_ns=state.time_ns,
+        mode=tick.mode,
+        position=None if tick.position_command is None else vector,
+        torque=vector if tick.position_command is None else None,
+        torque_limit=torque_limit if tick.mode is ControlMode.SERVO else None,
+    )
+
+
+def make_trace(
+    state: RobotState,
+    time: PhaseTime,
+    estimate: Estimate,
+    tick: Tick,
+    hand: HandTrace,
+    estimated: MotionEstimate | None,
+    delay_s: float,
+) -> ControllerTrace:
+    """Report every term of a tick; `estimated` is of `delay_s` ago."""
     zero = (0.0,) * len(tick.torque)
     terms, solution = tick.terms, tick.motion.solution
     reference, error, integral = tick.torque, zero, zero
@@ -133,6 +186,13 @@ def make_trace(state: RobotState, time: PhaseTime, estimate: Estimate, tick: Tic
             optional["wrench_estimated"] = _vector(sensed.hand.measured.wrench)
             optional["wrench_reference"] = _vector(sensed.hand.reference.wrench)
             optional["admittance"] = sensed.hand.compliance.active
+    if estimated is not None:
+        optional["estimated"] = _motion_trace(estimated, delay_s)
+    if tick.interface is not None and tick.posture is not None:
+        optional["offset"] = _offset_trace(tick.interface, tick.posture)
+        optional["wrench_reference"] = _vector(tick.interface.wrench_reference)
+        if tick.interface.wrench is not None:
+            optional["wrench_estimated"] = _vector(tick.interface.wrench)
     return ControllerTrace(
         sequence=state.sequence,
         time_ns=state.time_ns,
@@ -155,6 +215,36 @@ def make_trace(state: RobotState, time: PhaseTime, estimate: Estimate, tick: Tic
         qp_status=solution.status,
         relaxed=tick.motion.relaxed,
         **optional,
+    )
+
+
+def _motion_trace(sensed: MotionEstimate, delay_s: float) -> MotionTrace:
+    return MotionTrace(
+        delay_s=delay_s,
+        position=_vector(sensed.position),
+        velocity=_vector(sensed.velocity),
+        acceleration=_vector(sensed.acceleration),
+        torque=_vector(sensed.torque.torque),
+        link_torque=_vector(sensed.torque.link_torque),
+        base_wrench=_vector(sensed.torque.base_wrench),
+    )
+
+
+def _offset_trace(tick: InterfaceTick, posture: PostureTarget) -> OffsetTrace:
+    terms = tick.terms
+    return OffsetTrace(
+        position_desired=_vector(posture.position),
+        velocity_desired=_vector(posture.velocity),
+        acceleration_desired=_vector(posture.acceleration),
+        torque_desired=_vector(tick.torque_desired),
+        torque=_vector(terms.torque),
+        friction=_vector(terms.friction),
+        position=_vector(terms.position),
+        velocity=_vector(terms.velocity),
+        acceleration=_vector(terms.acceleration),
+        force=_vector(terms.force),
+        integral=_vector(terms.integral),
+        limited=tick.limited,
     )
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands import bus, can_vm, doctor, experiment, replay, report, service, stop, sweep, up
+from deploy.commands import bus, can_vm, doctor, experiment, identify, replay, report, service, stop, sweep, up
 from schemas.errors import CosimError
 
 app = typer.Typer(
@@ -30,7 +30,7 @@ def _options(
     del debug  # read by `main`, which must know it before parsing can fail
 
 
-for module in (up, service, stop, doctor, replay, report, experiment, sweep, bus, can_vm):
+for module in (up, service, stop, doctor, replay, report, identify, experiment, sweep, bus, can_vm):
     module.register(app)
 
 

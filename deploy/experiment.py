@@ -17,7 +17,7 @@ from schemas.errors import ConfigurationError, CosimError
 
 Metric = float | int | str | bool | None | list[float] | dict[str, float] | dict[str, str]
 
-RESULT_NAMES: Final = ("metrics.json", "sweep.png", "*/to_torque.png", "*/to_position.png")
+RESULT_NAMES: Final = ("metrics.json", "sweep.png", "*/to_torque.png", "*/to_position.png", "table-1.md")
 """Results at a run's place beside the figures that are called like their experiment."""
 
 
@@ -254,7 +254,7 @@ def combine(experiment: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 def _delete_results(place: Path) -> None:
     """Delete metrics and figures of an earlier run at a place, known by their names: other pictures stay."""
-    figures = [f"{name}.{kind}" for name in _module_names() for kind in ("png", "svg")]
+    figures = [f"{name}{more}.{kind}" for name in _module_names() for more in ("", "-*") for kind in ("png", "svg")]
     for pattern in (*RESULT_NAMES, *figures):
         for path in place.glob(pattern):
             try:

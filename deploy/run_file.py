@@ -6,8 +6,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from schemas.check_run import check_run
 from schemas.errors import ConfigurationError
-from schemas.load import Run, check_run
+from schemas.load import Run
 from schemas.log import RunRecord
 
 

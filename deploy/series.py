@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deploy.errors import ReportError
+from deploy.offset_series import MotionSeries, OffsetSeries, motion_series, offset_series, rows
 from schemas.base import ControlMode
 from schemas.load import Run
 from schemas.log import LogReader
@@ -25,6 +26,21 @@ from schemas.messages import (
     RobotState,
 )
 from schemas.topics import LOAD_PREFIX, decode
+
+__all__ = [
+    "Array",
+    "Integers",
+    "MotionSeries",
+    "OffsetSeries",
+    "RunSeries",
+    "StateSeries",
+    "TraceSeries",
+    "TruthSeries",
+    "read_series",
+    "state_series",
+    "trace_series",
+    "truth_series",
+]
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -42,6 +58,10 @@ class StateSeries:
     """(K, n) [N·m], measured; NaN where the drives report none."""
     wrench: Array
     """(K, 6) [N, N·m] of the first force/torque sensor, in its frame; NaN without."""
+    imu: Array
+    """(K, 6) angular velocity [rad/s], specific force [m/s²] of the first inertial unit, in its frame; NaN without."""
+    position_applied: Array
+    """(K, n) [rad] target that the drives latched at this SYNC and reach at the next; NaN in torque mode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +93,12 @@ class TraceSeries:
     """(K, 3) [m] in the world; NaN without a hand task."""
     orientation_desired: Array
     """(K, 4) quaternion (w, x, y, z); NaN without a hand task."""
+    wrench_estimated: Array
+    """(K, 6) [N, N·m] of the environment on the hand, world axes; NaN without."""
+    wrench_reference: Array
+    """(K, 6), as the above."""
+    estimated: MotionSeries
+    offset: OffsetSeries
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +109,10 @@ class TruthSeries:
     time_s: Array
     position: Array
     """(K, n) [rad]."""
+    velocity: Array
+    """(K, n) [rad/s]."""
+    joint_torque: Array
+    """(K, n) [N·m] motor torque and friction as they act in the substep that ended here; NaN at sequence 0."""
     mode: Integers
     """(K, n) CiA 402 mode in effect during the period that ended here; 0 when the power stage was off."""
     motor_torque_substeps: Array
@@ -172,9 +202,11 @@ def state_series(states: list[RobotState], n: int) -> StateSeries:
     return StateSeries(
         sequence=np.array([s.sequence for s in states], np.int64),
         time_s=_seconds([s.time_ns for s in states]),
-        position=_rows([s.position_measured for s in states], n),
-        motor_torque=_rows([s.motor_torque_measured or absent for s in states], n),
-        wrench=_rows([_wrench(s) for s in states], 6),
+        position=rows([s.position_measured for s in states], n),
+        motor_torque=rows([s.motor_torque_measured or absent for s in states], n),
+        wrench=rows([_wrench(s) for s in states], 6),
+        imu=rows([_imu(s) for s in states], 6),
+        position_applied=rows([s.applied.position or absent for s in states], n),
     )
 
 
@@ -186,17 +218,21 @@ def trace_series(traces: list[ControllerTrace], n: int) -> TraceSeries:
         time_s=_seconds([t.time_ns for t in traces]),
         phase=tuple(t.phase for t in traces),
         torque_mode=np.array([t.mode is ControlMode.TORQUE for t in traces], np.bool_),
-        torque_reference=_rows([t.torque_reference for t in traces], n),
-        torque_integral=_rows([t.torque_integral for t in traces], n),
-        torque_windup=_rows([t.torque_windup or nothing for t in traces], n),
-        torque_limited=_rows([t.torque_limited or nothing for t in traces], n),
-        windup_bound=_rows([t.windup_bound or nothing for t in traces], n),
+        torque_reference=rows([t.torque_reference for t in traces], n),
+        torque_integral=rows([t.torque_integral for t in traces], n),
+        torque_windup=rows([t.torque_windup or nothing for t in traces], n),
+        torque_limited=rows([t.torque_limited or nothing for t in traces], n),
+        windup_bound=rows([t.windup_bound or nothing for t in traces], n),
         null_space_share=np.array([t.null_space_share for t in traces], np.float64),
         admittance=np.array([t.admittance for t in traces], np.bool_),
-        torque_commanded=_rows([t.torque_commanded for t in traces], n),
-        position_reference=_rows([t.position_reference for t in traces], n),
-        hand_desired=_rows([t.hand_desired.position_in_world if t.hand_desired else absent for t in traces], 3),
+        torque_commanded=rows([t.torque_commanded for t in traces], n),
+        position_reference=rows([t.position_reference for t in traces], n),
+        hand_desired=rows([t.hand_desired.position_in_world if t.hand_desired else absent for t in traces], 3),
         orientation_desired=_orientations([t.hand_desired for t in traces]),
+        wrench_estimated=rows([t.wrench_estimated or (np.nan,) * 6 for t in traces], 6),
+        wrench_reference=rows([t.wrench_reference or (np.nan,) * 6 for t in traces], 6),
+        estimated=motion_series(traces, n),
+        offset=offset_series(traces, n),
     )
 
 
@@ -212,16 +248,21 @@ def truth_series(truths: list[PlantTruth], n: int, hand_frame: str | None) -> Tr
     frames = truths[0].frames if truths else {}
     forces = dict.fromkeys(name for t in truths for name in t.world_forces)
     still = (0.0,) * 3
+    acting = rows([t.friction_torque for t in truths], n)
+    if substeps:
+        acting += torque[:, -1]
     return TruthSeries(
         sequence=np.array([t.sequence for t in truths], np.int64),
         time_s=_seconds([t.time_ns for t in truths]),
-        position=_rows([t.position for t in truths], n),
+        position=rows([t.position for t in truths], n),
+        velocity=rows([t.velocity for t in truths], n),
+        joint_torque=acting,
         mode=np.array([t.mode for t in truths], np.int64).reshape(len(truths), n),
         motor_torque_substeps=torque,
-        hand=_rows([hand.position_in_world if hand else absent for hand in hands], 3),
+        hand=rows([hand.position_in_world if hand else absent for hand in hands], 3),
         hand_orientation=_orientations(hands),
-        frames={name: _rows([t.frames[name].position_in_world for t in truths], 3) for name in frames},
-        world_forces={name: _rows([t.world_forces.get(name, still) for t in truths], 3) for name in forces},
+        frames={name: rows([t.frames[name].position_in_world for t in truths], 3) for name in frames},
+        world_forces={name: rows([t.world_forces.get(name, still) for t in truths], 3) for name in forces},
         contacts=tuple(t.contacts for t in truths),
         kinetic_energy=np.array([t.kinetic_energy for t in truths], np.float64),
     )
@@ -233,12 +274,14 @@ def _wrench(state: RobotState) -> tuple[float, ...]:
     return state.wrenches[0].force_in_sensor + state.wrenches[0].torque_in_sensor
 
 
+def _imu(state: RobotState) -> tuple[float, ...]:
+    if not state.imus:
+        return (np.nan,) * 6
+    return state.imus[0].angular_velocity_in_imu + state.imus[0].acceleration_in_imu
+
+
 def _orientations(poses: Sequence[PoseSample | None]) -> Array:
-    return _rows([pose.orientation_to_world if pose else (np.nan,) * 4 for pose in poses], 4)
-
-
-def _rows(values: Sequence[tuple[float, ...]], n: int) -> Array:
-    return np.array(values, np.float64).reshape(len(values), n)
+    return rows([pose.orientation_to_world if pose else (np.nan,) * 4 for pose in poses], 4)
 
 
 def _seconds(times_ns: list[int]) -> Array:

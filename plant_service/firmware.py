@@ -5,12 +5,17 @@
 
 τ is what the drive believes it gives and reports as current; the motor gives `torque_scale` times as much. One law
 serves all modes: gains of zero make torque mode, everything zero is power off. Between two SYNCs the target moves
-linearly to the one latched last (CSP interpolation) and q̇_t is its slope.
+linearly to the one latched last (CSP interpolation) and q̇_t is its slope, or zero for drives whose law has none
+(`Drive.velocity_reference`).
+
+With a `DriveAsymmetry` the gains of the position modes are k_p (1 + α_p σ) and k_d (1 + α_d σ), σ = tanh(q̇/v₀) of the
+true velocity at each step: section 3.2.1 of [Del Prete 2016] found such drives.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +57,10 @@ class Firmware:
         self._dead_zone = gains.dead_zone * config.dead_zone_scale
         self._own_limit = gains.torque_limit.copy()
         self._hold_ramp_s = np.full(n, description.safety.hold_ramp_s)
+        references = [joint.drive.velocity_reference for joint in description.joints]
+        self._slope_time_s = [math.inf if each == "zero" else self._period_s for each in references]
+        asymmetry = config.drive_asymmetry
+        self._asymmetry = asymmetry if asymmetry.position_gain or asymmetry.velocity_gain else None
         self._noise = config.noise.motor_torque
         self._generator = np.random.default_rng([seed, MOTOR_NOISE_STREAM])
 
@@ -81,6 +90,7 @@ class Firmware:
         self._velocity = np.zeros(n)
         self._fractions = np.arange(substeps)[:, np.newaxis] / substeps
         self._bias = np.zeros((substeps, n))
+        self._targets = np.zeros((substeps, n))
         self._count_stiffness = np.zeros(n)
         self.counts: list[int] = [0] * n
         self.per_mille: list[int] = [0] * n
@@ -107,6 +117,9 @@ class Firmware:
             return
         zero, resolution = self._units.zero_offset, self._units.radian_per_count
         targets = self._target + self._fractions * (self._goal - self._target)
+        if self._asymmetry is not None:
+            self._targets = targets - zero
+            return
         self._bias = self._stiffness * (targets - zero) + self._damping * self._target_velocity + self._feedforward
         self._count_stiffness = self._stiffness * resolution
 
@@ -115,9 +128,22 @@ class Firmware:
         if not self.constant:
             # Counts as the drive reads them; k_p (zero + counts · resolution) is split between here and the bias.
             counts = np.rint((position - self._units.zero_offset) / self._units.radian_per_count)
-            effort = self._bias[substep] - counts * self._count_stiffness - velocity * self._damping
+            if self._asymmetry is None:
+                effort = self._bias[substep] - counts * self._count_stiffness - velocity * self._damping
+            else:
+                stiffness, damping = self._gains_at(velocity, self._stiffness, self._damping)
+                effort = stiffness * (self._targets[substep] - counts * self._units.radian_per_count)
+                effort += damping * (self._target_velocity - velocity) + self._feedforward
             self.torque = self._torque_of(effort)
         return self.torque
+
+    def _gains_at(self, velocity: Array, stiffness: Array, damping: Array) -> tuple[Array, Array]:
+        """k_p (1 + α_p σ) and k_d (1 + α_d σ), σ = tanh(q̇/v₀)."""
+        asymmetry = self._asymmetry
+        if asymmetry is None:
+            return stiffness, damping
+        sigma = np.tanh(velocity / asymmetry.smoothing_velocity)
+        return stiffness * (1.0 + asymmetry.position_gain * sigma), damping * (1.0 + asymmetry.velocity_gain * sigma)
 
     def _torque_of(self, effort: Array) -> Array:
         """τ of x: dead zone and limit."""
@@ -160,7 +186,7 @@ class Firmware:
             self._set_law(joint, POSITION, self._position_gain[joint], self._velocity_gain[joint], 0.0)
             self._follow(joint, POSITION)
         self._goal_of[joint] = goal
-        self._target_velocity_of[joint] = (goal - start) / self._period_s
+        self._target_velocity_of[joint] = (goal - start) / self._slope_time_s[joint]
         if max_per_mille != self._limited_to[joint]:
             self._limit_to(joint, max_per_mille)
 
@@ -177,14 +203,14 @@ class Firmware:
         """Hold: take the target at which the position loop gives the torque now acting, then ramp its offset to zero.
 
         q_t = q + (D⁻¹(τ) + k_d q̇) / k_p with q̇_t = 0. From torque mode or power off the ramp ends at q; a drive that
-        was following positions keeps its last target, and the ramp ends there.
+        was following positions keeps its last target, and the ramp ends there. k_p and k_d are those of the drive's own
+        law at q̇, asymmetric or not.
         """
         if joint in self._held:
             return
         one = slice(joint, joint + 1)
-        gains = FirmwareGains(
-            self._position_gain[one], self._velocity_gain[one], self._dead_zone[one], self._limit[one]
-        )
+        stiffness, damping = self._gains_at(self._velocity[one], self._position_gain[one], self._velocity_gain[one])
+        gains = FirmwareGains(stiffness, damping, self._dead_zone[one], self._limit[one])
         encoder = self._zero_of[joint] + self.counts[joint] * self._radian_of[joint]
         start = encoder + holding_offset(self.torque[one], self._velocity[one], gains).item()
         was_off = self.mode[joint] == OFF

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plant_service.errors import PlantError
 from plant_service.friction import friction_factors
-from plant_service.obstacles import add_obstacles, refuse_penetration
+from plant_service.obstacles import add_contact_boxes, add_obstacles, refuse_penetration
 from schemas.load import Robot
 from schemas.scenario import PlantConfig
 
@@ -49,12 +49,14 @@ def build(robot: Robot, config: PlantConfig, seed: int) -> PlantModel:
     """Build the plant's model.
 
     Armature J N² and viscous friction N² v come from the description and the scenario; joints of the URDF that the
-    description does not name are locked at zero; meshes are left out, primitives kept; links joined by one joint do
-    not collide. Every link's mass and inertia is multiplied by 1 ± `config.mass_error`, signs drawn from `seed`, every
-    joint's friction by a factor within 1 ± `config.friction_error`. The world's obstacles touch all moving links.
+    description does not name are locked at zero; meshes are left out, primitives kept and the description's
+    `contact_boxes` added, without mass; links joined by one joint do not collide. Every link's mass and inertia is
+    multiplied by 1 ± `config.mass_error`, signs drawn from `seed`, every joint's friction by a factor within
+    1 ± `config.friction_error`. The world's obstacles touch all moving links.
 
     Raises:
-        PlantError: MuJoCo cannot build the URDF, a frame or joint is missing in it, or the robot starts in an obstacle.
+        PlantError: MuJoCo cannot build the URDF, a frame, joint or link is missing in it, or the robot starts in an
+            obstacle.
 
     """
     description = robot.description
@@ -69,7 +71,8 @@ def build(robot: Robot, config: PlantConfig, seed: int) -> PlantModel:
     _set_joints(spec, robot, config, friction)
     factors = _perturb_masses(spec, config.mass_error, seed)
     _add_sensors(spec, robot)
-    _exclude_neighbours(spec, description.name)
+    add_contact_boxes(spec, description.contact_boxes, description.name)
+    _exclude_neighbours(spec, description.name)  # those with shapes, so after all shapes of links
     add_obstacles(spec, config.world, description.name)
     model = _compile(spec, description.name)
 

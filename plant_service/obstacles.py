@@ -1,4 +1,4 @@
-"""Obstacles as fixed rigid shapes of the MuJoCo model, and what touches what.
+"""Obstacles as fixed rigid shapes of the MuJoCo model, boxes of links that touch them, and what touches what.
 
 An obstacle's own contact parameters hold against every link (`priority`); contacts of the robot with itself keep
 MuJoCo's. Dry friction is MuJoCo's pyramid: |f₁| + |f₂| ≤ μ f_n along the two tangents of a contact.
@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from plant_service.errors import PlantError
 from schemas.base import Vector3
 from schemas.messages import ContactSample
+from schemas.robot import LinkBox
 from schemas.world import Box, Pole, World
 
 Array = NDArray[np.float64]
 
 PREFIX: Final = "obstacle/"
 """Of the names of obstacles' geoms in the MuJoCo model."""
+CONTACT_BOX_PREFIX: Final = "contact_box/"
+"""Of the names of the geoms of contact boxes."""
 CONTACT_TIME_S: Final = 0.004
 """Time constant of a contact: what hits an obstacle is stopped within several substeps, critically damped, so without
 bouncing, and no harder with smaller substeps. MuJoCo scales a contact by the inertia that it feels, reflected rotors
@@ -29,8 +32,37 @@ included, so that this holds for a finger as for a shoulder."""
 CONTACT_IMPEDANCE: Final = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """MuJoCo's largest, at any depth, as for joint friction: at rest links sink in by less than 1 µm, and stick without
 creeping."""
+SPRUNG_IMPEDANCE: Final = (0.95, 0.95, 0.001, 0.5, 2.0)
+"""Of a box on springs: links sink in by some 10 µm. With the largest it would be less than what moves in a substep, and
+a contact that carries hundreds of newtons would open for one."""
+SPRING_DAMPING: Final = 0.5
+"""Damping ratio of a box on springs, by itself."""
 TOUCHING_M: Final = 1e-6
 """Depth at the start that is no penetration but rounding."""
+
+
+def add_contact_boxes(spec: mujoco.MjSpec, boxes: Sequence[LinkBox], robot: str) -> None:
+    """Add a description's contact boxes to their links in a model that is not compiled yet.
+
+    They touch as the URDF's primitives do and have no mass: that of the link is the URDF's.
+
+    Raises:
+        PlantError: a box lies on a link that the URDF does not have.
+
+    """
+    for index, box in enumerate(boxes):
+        body = spec.body(box.link)
+        if body is None or body == spec.worldbody:
+            links = ", ".join(each.name for each in spec.bodies[1:])
+            raise PlantError(f"contact_boxes.{index}.link: {robot} has no link {box.link!r}; it has {links}")
+        body.add_geom(
+            name=CONTACT_BOX_PREFIX + box.name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.position_in_link,
+            quat=box.orientation_to_link,
+            size=box.half_sizes,
+            mass=0.0,
+        )
 
 
 def add_obstacles(spec: mujoco.MjSpec, world: World, robot: str) -> None:
@@ -46,20 +78,20 @@ def add_obstacles(spec: mujoco.MjSpec, world: World, robot: str) -> None:
     if not any(geom.contype for body in spec.bodies if _moves(body) for geom in body.geoms):
         raise PlantError(
             f"plant.world.obstacles: no moving link of {robot} has a collision shape to touch them with; of the URDF"
-            " the plant takes boxes, cylinders and spheres, no meshes"
+            " the plant takes boxes, cylinders and spheres, no meshes; give the robot contact_boxes"
         )
     for index, obstacle in enumerate(world.obstacles):
         if obstacle.name in links:
             raise PlantError(
                 f"plant.world.obstacles.{index}.name: {obstacle.name!r} is a link of {robot}; give it a name of its own"
             )
-        geom = spec.worldbody.add_geom(
+        geom = _owner(spec, obstacle).add_geom(
             name=PREFIX + obstacle.name,
             priority=1,
             condim=3,
             friction=[obstacle.friction, 0.0, 0.0],
             solref=[CONTACT_TIME_S, 1.0],
-            solimp=CONTACT_IMPEDANCE,
+            solimp=SPRUNG_IMPEDANCE if isinstance(obstacle, Box) and obstacle.stiffness else CONTACT_IMPEDANCE,
         )
         match obstacle:
             case Pole():
@@ -68,9 +100,25 @@ def add_obstacles(spec: mujoco.MjSpec, world: World, robot: str) -> None:
                 geom.size = [obstacle.radius, 0.0, 0.0]
             case Box():
                 geom.type = mujoco.mjtGeom.mjGEOM_BOX
+                geom.mass = obstacle.mass
                 geom.pos = obstacle.position_in_world
                 geom.quat = obstacle.orientation_to_world
                 geom.size = obstacle.half_sizes
+
+
+def _owner(spec: mujoco.MjSpec, obstacle: Pole | Box) -> mujoco.MjsBody:
+    """Body that an obstacle's shape belongs to: the world, or one of its own on springs, at the world's origin."""
+    if isinstance(obstacle, Pole) or obstacle.stiffness is None:
+        return spec.worldbody
+    body = spec.worldbody.add_body(name=PREFIX + obstacle.name, gravcomp=1.0)
+    for axis in np.eye(3):
+        body.add_joint(
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=axis,
+            stiffness=[obstacle.stiffness, 0.0, 0.0],
+            damping=[2.0 * SPRING_DAMPING * (obstacle.stiffness * obstacle.mass) ** 0.5, 0.0, 0.0],
+        )
+    return body
 
 
 def refuse_penetration(

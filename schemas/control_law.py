@@ -1,4 +1,4 @@
-"""Parts of the controller that [Benallegue 2021] adds to its law, each a model of its own with the paper's values."""
+"""Parts of the controller that the papers add to its law, each a model of its own with the paper's values."""
 
 from __future__ import annotations
 
@@ -199,3 +199,113 @@ class CollisionAvoidance(Model):
         if not self.safe_m < self.influence_m:
             raise ValueError(f"safe_m {self.safe_m:g} must lie below influence_m {self.influence_m:g}")
         return self
+
+
+class SavitzkyGolayFilter(Model):
+    """Polynomials fitted to a moving window, section 2.1 of [Del Prete 2016]; the paper's values."""
+
+    window: Annotated[int, Field(ge=3)] = 80
+    """Samples."""
+    encoder_order: Annotated[int, Field(ge=2)] = 2
+    """Of the joints' positions, whose first and second derivatives are used."""
+    sensor_order: Annotated[int, Field(ge=1)] = 1
+    """Of force/torque sensor and inertial unit."""
+    evaluate_at: Literal["centre", "end"] = "centre"
+    """Of the window: late by half of it, or not late and noisier."""
+
+
+class JointKalmanFilter(Model):
+    """Joint motion from the encoders and a model of drives and robot, without the window's delay."""
+
+    acceleration_noise: PositiveFloat = 5.0
+    """[rad/s²] white, of the modelled acceleration."""
+    disturbance_noise: PositiveFloat = 20.0
+    """[rad/s² per √s]: how fast what the model lacks changes."""
+    sensor_cutoff_hz: PositiveFloat = 50.0
+    """First-order low-pass of force/torque sensor and inertial unit."""
+    feedback_cutoff_hz: PositiveFloat = 5.0
+    """First-order low-pass of ë_q and e_f. q̈̂ holds what the drives' model makes of the last command, so that its loop
+    has the gain K_p, and that of e_f K_p + (1 + K_p) K_f: 2 and 5 with the paper's values, which must have fallen
+    below 1 before the command's delay has turned the phase. The window does the same by its length."""
+
+
+class MotorModel(Model):
+    """Identified model of a position-controlled motor, (6) of [Del Prete 2016]: Δq = k_τ τ + k_v q̇ + k_c sign(q̇)."""
+
+    torque_gain: PositiveFloat
+    """k_τ [rad/(N·m)]."""
+    velocity_gain: NonNegative
+    """k_v [s]."""
+    coulomb: NonNegative = 0.0
+    """k_c [rad]; the controller gives it smoothly, k_c tanh(q̇/`coulomb_velocity`)."""
+
+
+class SensorPayload(Model):
+    """Identified body beyond a force/torque sensor, and the sensor's offsets (section 2.2 of [Del Prete 2016])."""
+
+    mass: PositiveFloat
+    """[kg]."""
+    centre_in_sensor: Vector3
+    """[m]."""
+    force_offset: Vector3 = (0.0, 0.0, 0.0)
+    """[N] in the sensor's frame: what it reads without load."""
+    torque_offset: Vector3 = (0.0, 0.0, 0.0)
+    """[N·m]."""
+
+
+class PositionTorque(Model):
+    """Torque control through drives that take positions only, section 4 of [Del Prete 2016].
+
+    Δq = K_τ τ* + K_v q̇ (10), τ* = τ^d + K_p e_τ + K_i ∫e_τ (11); the command is q + Δq.
+    """
+
+    motors: dict[str, MotorModel] = Field(default_factory=dict)
+    """Of every joint, by name."""
+    motors_from: str | None = None
+    """A packaged set or YAML file, as `cosim identify motors` writes it, whose motors stand below `motors`."""
+    torque_gain: NonNegative = 2.0
+    """K_p."""
+    torque_integral: NonNegative = 0.0
+    """K_i [1/s]; the paper saw no use in it."""
+    force_gain: NonNegative = 1.0
+    """K_f."""
+    position_gain: NonNegative = 1.0
+    """K₆ [rad/rad]: 1 is as stiff as the drive itself. The stiffness is K_s = K₆ / (k_τ (1 + K_p))."""
+    velocity_gain: NonNegative = 0.01
+    """K₇ [s]; the damping is K_d = K₇ / (k_τ (1 + K_p)). The paper does not give it. About as much as the friction's
+    feed-forward takes away keeps a foot from hopping that has lost its contact and finds it again."""
+    feedforward: Share = 1.0
+    """Share of K_τ τ^d and K_v q̇ that is given."""
+    coulomb_velocity: PositiveFloat = 0.1
+    """[rad/s]."""
+    desired: Literal["inverse_dynamics", "qp"] = "inverse_dynamics"
+    """τ^d of (12), or the QP's M q̈ʳ + h with the tasks of the phase."""
+    estimator: Literal["savitzky_golay", "kalman"] = "savitzky_golay"
+    savitzky_golay: SavitzkyGolayFilter = SavitzkyGolayFilter()
+    kalman: JointKalmanFilter = JointKalmanFilter()
+    sensor: str | None = None
+    """Force/torque sensor at the end effector; None: no contact is assumed."""
+    payload: SensorPayload | None = None
+    """Of that sensor, instead of the URDF's body and no offsets."""
+    imu: str | None = None
+    """Inertial unit that tells the base's motion; None: the base stands still."""
+    predict_velocity: bool = True
+    """Carry a late velocity forward by what was desired since: q̇(t) ≈ q̇̂(t − t_d) + q̇^d(t) − q̇^d(t − t_d), for the
+    friction and δ. The loop is the same as without, only what the posture asks for is no longer late. The paper has
+    q̇̂(t − t_d) alone."""
+    compensate_delay: bool = True
+    """Command q + Δq + δ q̇ with the known delay δ from the sample to the drive's action, since the drive works with
+    its own newest position; False: q + Δq, and the drive is damped by k_p δ."""
+    start_s: PositiveFloat = 0.3
+    """The difference between what the position control gave and what the law asks goes to zero in this time."""
+
+
+class SineWrench(Model):
+    """F^d(t) = mean + amplitude sin(2π f t) of the environment on the hand frame, world axes, at its origin."""
+
+    mean: tuple[float, float, float, float, float, float]
+    """[N, N·m]."""
+    amplitude: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    frequency_hz: PositiveFloat = 0.5
+    ramp_s: PositiveFloat = 1.0
+    """Time in which the mean is reached, along a minimum-jerk curve; the sine begins then."""

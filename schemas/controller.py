@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from itertools import pairwise
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from schemas.base import ControlMode, Model
 from schemas.control_law import (
@@ -15,12 +16,14 @@ from schemas.control_law import (
     HandForce,
     Leak,
     NullSpace,
+    PositionTorque,
+    SineWrench,
 )
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 
 
-OPTIONAL_PARTS = ("null_space", "friction_compensation", "observer", "hand_force", "collision")
+OPTIONAL_PARTS = ("null_space", "friction_compensation", "observer", "hand_force", "collision", "position_torque")
 """Of `ControllerConfig`; an empty mapping takes a part with its defaults."""
 
 
@@ -44,6 +47,47 @@ class HandPath(Model):
     laps: PositiveInt = 1
 
 
+class JointPoint(Model):
+    """A posture and when it is passed."""
+
+    time_s: Annotated[float, Field(gt=0.0)]
+    """Since the phase's start."""
+    posture: dict[str, float]
+    """Joint angles [rad]; joints not named stay where they were before."""
+
+
+class JointPath(Model):
+    """A motion through postures: a spline of fifth degree, at rest at its ends, C⁴ between (`controller_service`)."""
+
+    points: Annotated[tuple[JointPoint, ...], Field(min_length=1)]
+    """After the start, which is where the joints were."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for before, after in pairwise(self.points):
+            if not before.time_s < after.time_s:
+                raise ValueError(f"the point at {after.time_s:g} s does not come after the one at {before.time_s:g} s")
+        return self
+
+
+class GrowingSine(Model):
+    """(a₀ + a t) sin(2π f t) about where the joint was, section 3.4.2 of [Del Prete 2016]."""
+
+    amplitude: NonNegative = 0.0
+    """a₀ [rad]."""
+    growth: NonNegative = 0.0
+    """a [rad/s]."""
+    frequency_hz: PositiveFloat
+
+
+class JointSines(Model):
+    """Growing sinusoids of some joints, faded in and out so that they begin and end at rest."""
+
+    joints: Annotated[dict[str, GrowingSine], Field(min_length=1)]
+    fade_s: PositiveFloat = 0.5
+    """Length of both ramps, along minimum-jerk curves."""
+
+
 class Phase(Model):
     """A stretch of a run: the mode of the drives and what the tasks follow. What is absent is held."""
 
@@ -53,6 +97,24 @@ class Phase(Model):
     posture: dict[str, float] = Field(default_factory=dict)
     """Joint angles [rad] to reach by a minimum-jerk motion within the phase; joints not named stay."""
     hand_path: HandPath | None = None
+    joint_path: JointPath | None = None
+    joint_sines: JointSines | None = None
+    torque_control: bool = False
+    """Torque control through the position interface (`controller.position_torque`), in mode `position`."""
+    wrench: SineWrench | None = None
+    """To be exerted by the environment on the hand frame, with `torque_control`."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        motions = {"posture": self.posture, "joint_path": self.joint_path, "joint_sines": self.joint_sines}
+        named = [name for name, motion in motions.items() if motion]
+        if len(named) > 1:
+            raise ValueError(f"{' and '.join(named)} are both given; a phase has one motion of the joints")
+        if self.torque_control and self.mode is not ControlMode.POSITION:
+            raise ValueError(f"torque_control goes through drives in mode position, mode is {self.mode.value}")
+        if self.wrench is not None and not self.torque_control:
+            raise ValueError("wrench: a wrench is controlled with torque_control: true only")
+        return self
 
 
 class QpConfig(Model):
@@ -89,6 +151,7 @@ class ControllerConfig(Model):
     observer: DisturbanceObserver | None = None
     hand_force: HandForce | None = None
     collision: CollisionAvoidance | None = None
+    position_torque: PositionTorque | None = None
     initialize_integral: bool = True
     """Position→torque transition: start the integral term at the torque difference (section IV-A); False is naive."""
     velocity_cutoff_hz: PositiveFloat = 60.0

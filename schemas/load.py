@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,17 +14,13 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from schemas.bus_load import cycle_plan
+from schemas.check_run import check_run
 from schemas.controller import OPTIONAL_PARTS
 from schemas.errors import ConfigurationError
 from schemas.robot import RobotDescription
 from schemas.scenario import Scenario
 
 M = TypeVar("M", bound=BaseModel)
-
-MAXIMUM_BACK_CALCULATION_PERIOD = 0.5
-"""κT above this is near the border of stability where J⁺ is far from orthogonal."""
-MAXIMUM_LAMBDA_PERIOD = 0.3
-"""λT above this leaves no phase margin for the integral loop with a cycle of delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +61,7 @@ def load_run(scenario: str, overrides: dict[str, Any] | None = None) -> Run:
     for key, value in (overrides or {}).items():
         of_robot = key.startswith("robot.")
         split[of_robot][key.removeprefix("robot.")] = value
-    data = _with_gains(_override(_read_yaml(path), split[False], path), path)
+    data = _with_motors(_with_gains(_override(_read_yaml(path), split[False], path), path), path)
     config = _parse(Scenario, data, path)
     beside = path.parent / config.robot
     name = str(beside) if beside.is_file() else config.robot
@@ -132,64 +127,25 @@ def resolve_urdf(urdf: str, robot_file: Path) -> Path:
     return path
 
 
-def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> None:
-    """Refuse a scenario that does not fit its robot.
-
-    Raises:
-        ConfigurationError: unknown joint, substep that does not divide the period, λT above 0.3, …
-
-    """
-    if round(scenario.duration_s * robot.rate_hz) < 1:
+def _with_motors(data: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Lay a scenario's motor models over those of the file that it names."""
+    controller = data.get("controller")
+    config = controller.get("position_torque") if isinstance(controller, dict) else None
+    name = config.get("motors_from") if isinstance(config, dict) else None
+    if not isinstance(controller, dict) or not isinstance(config, dict) or not isinstance(name, str):
+        return data
+    beside = path.parent / name
+    source = beside if beside.is_file() else _find(name, "motors", "motors")
+    identified = _read_yaml(source).get("motors")
+    if not isinstance(identified, dict):
         raise ConfigurationError(
-            f"{path}: duration_s: {scenario.duration_s:g} s is shorter than a cycle of {robot.period_s:g} s"
+            f"{source}: motors: expected a mapping of joints, as `cosim identify motors` writes it"
         )
-    names = set(robot.joint_names)
-    limits = {joint.name: (joint.position_min, joint.position_max) for joint in robot.joints}
-    mentions = [("plant.initial_posture", joint) for joint in scenario.plant.initial_posture]
-    mentions += [
-        (f"controller.phases.{index}.posture", joint)
-        for index, phase in enumerate(scenario.controller.phases)
-        for joint in phase.posture
-    ]
-    for field, joint in mentions:
-        if joint not in names:
-            raise ConfigurationError(
-                f"{path}: {field}: robot {robot.name} has no joint {joint!r}; it has {', '.join(robot.joint_names)}"
-            )
-    for index, phase in enumerate(scenario.controller.phases):
-        for joint, angle in phase.posture.items():
-            low, high = limits[joint]
-            if not low <= angle <= high:
-                raise ConfigurationError(
-                    f"{path}: controller.phases.{index}.posture.{joint}: {angle:g} rad lies outside"
-                    f" [{low:g}, {high:g}] rad"
-                )
-    ratio = robot.period_s / scenario.plant.substep_s
-    if not math.isclose(ratio, round(ratio), rel_tol=1e-9) or ratio < 1.0:
-        raise ConfigurationError(
-            f"{path}: plant.substep_s: {scenario.plant.substep_s:g} s does not divide the period {robot.period_s:g} s"
-        )
-    product = scenario.controller.lambda_ * robot.period_s
-    if product > MAXIMUM_LAMBDA_PERIOD:
-        raise ConfigurationError(
-            f"{path}: controller.lambda: λT = {product:.3g} with T = {robot.period_s:g} s; expected at most"
-            f" {MAXIMUM_LAMBDA_PERIOD} (λ ≤ {MAXIMUM_LAMBDA_PERIOD * robot.rate_hz:g}), or the integral loop"
-            " is unstable"
-        )
-    share = scenario.controller.anti_windup.back_calculation * robot.period_s
-    if share > MAXIMUM_BACK_CALCULATION_PERIOD:
-        raise ConfigurationError(
-            f"{path}: controller.anti_windup.back_calculation: κT = {share:.3g} with T = {robot.period_s:g} s; expected"
-            f" at most {MAXIMUM_BACK_CALCULATION_PERIOD}, or the state swings about its limit"
-        )
-    for part in ("null_space", "hand_force"):
-        if getattr(scenario.controller, part) is not None and robot.hand_frame is None:
-            raise ConfigurationError(f"{path}: controller.{part}: robot {robot.name} has no hand_frame")
-    for index, phase in enumerate(scenario.controller.phases):
-        if phase.hand_path is not None and robot.hand_frame is None:
-            raise ConfigurationError(
-                f"{path}: controller.phases.{index}.hand_path: robot {robot.name} has no hand_frame"
-            )
+    own = config.get("motors") or {}
+    if not isinstance(own, dict):
+        return data  # for the model to refuse
+    motors = _overlay(identified, own)
+    return data | {"controller": controller | {"position_torque": config | {"motors": motors}}}
 
 
 def _with_gains(data: dict[str, Any], path: Path) -> dict[str, Any]:

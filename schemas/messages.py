@@ -117,6 +117,51 @@ class PoseSample(Model):
     orientation_to_world: Quaternion
 
 
+class MotionTrace(Model):
+    """What Algorithm 1 of [Del Prete 2016] makes of encoders, inertial unit and force/torque sensor."""
+
+    delay_s: float
+    """All of it is of this long ago."""
+    position: Vector
+    """q̂ [rad]."""
+    velocity: Vector
+    """q̇̂ [rad/s]."""
+    acceleration: Vector
+    """q̈̂ [rad/s²]."""
+    torque: Vector
+    """τ̂ [N·m]: motor torque less friction, with the rotors' reflected inertia, as in (6)."""
+    link_torque: Vector
+    """[N·m] what a sensor behind the gear would measure: without the rotors' inertia."""
+    base_wrench: Vector
+    """[N, N·m] what the mount of a fixed base exerts, or the unknown wrench on a floating one; base axes and origin."""
+
+
+class OffsetTrace(Model):
+    """The parts of Δq in (13) and (14) of [Del Prete 2016] [rad], and what they follow."""
+
+    position_desired: Vector
+    """q^d [rad]."""
+    velocity_desired: Vector
+    acceleration_desired: Vector
+    torque_desired: Vector
+    """M q̈^d + ĥ − Jᵀ f^d [N·m], or the QP's."""
+    torque: Vector
+    """Feed-forward torque."""
+    friction: Vector
+    """Feed-forward friction."""
+    position: Vector
+    """K₆ e_q."""
+    velocity: Vector
+    """K₇ ė_q."""
+    acceleration: Vector
+    """K₈ ë_q, or K_τ K_p e_τ with the QP's τ^d."""
+    force: Vector
+    """K₉ e_f."""
+    integral: Vector
+    limited: tuple[str, ...] = ()
+    """Limits that act, by joint."""
+
+
 class ControllerTrace(Model):
     """Every term of the control law at one tick; on `…/trace`. Symbols of [Benallegue 2021] in brackets."""
 
@@ -168,6 +213,10 @@ class ControllerTrace(Model):
     qp_primal_residual: float
     qp_dual_residual: float
     qp_status: str
+    estimated: MotionTrace | None = None
+    """With `controller.position_torque`: Algorithm 1 of [Del Prete 2016]."""
+    offset: OffsetTrace | None = None
+    """Under torque control through the position interface."""
 
 
 class ContactSample(Model):

@@ -6,7 +6,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from schemas.base import Model, Vector3
+from schemas.base import Model, Quaternion, Vector3
+from schemas.world import UNIT_TOLERANCE
 
 NodeId = Annotated[int, Field(ge=1, le=127)]
 RESERVED_IDENTIFIERS = (0x000, 0x080, 0x77F)
@@ -60,6 +61,7 @@ class Drive(Model):
 
     Firmware in the position modes: τ = D(k_p (q_t − q) + k_d (q̇_t − q̇)), clipped to the torque limit, where D is the
     current's dead zone D(x) = sign(x) max(|x| − d, 0); in torque mode τ = D(τ_t). All at the joint, in N·m and rad.
+    Between two set-points the target q_t moves linearly; q̇_t is its slope, or zero (`velocity_reference`).
     """
 
     kind: Literal["position_pd", "torque", "servo"]
@@ -73,6 +75,9 @@ class Drive(Model):
     """k_d [N·m·s/rad] at the joint."""
     dead_zone: NonNegative = 0.0
     """d [N·m] at the joint, as known to the HAL, which commands its inverse; the plant's may differ."""
+    velocity_reference: Literal["interpolated", "zero"] = "interpolated"
+    """q̇_t: the slope of the interpolated target, or zero, as HRP-2's drives have it: i = K₄ (q^d − q) − K₅ q̇, (5) of
+    [Del Prete 2016]."""
     vendor_id: int = 0x00000402
     product_code: int = 0x00000001
 
@@ -156,6 +161,26 @@ class Capsule(Model):
     radius: PositiveFloat
 
 
+class LinkBox(Model):
+    """A box fixed to a link, for the simulated contact of links whose URDF has only meshes."""
+
+    name: Annotated[str, Field(min_length=1)]
+    link: str
+    """URDF link."""
+    position_in_link: Vector3
+    """Of its centre [m]."""
+    half_sizes: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+    """Along its own axes [m]."""
+    orientation_to_link: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        norm = sum(value * value for value in self.orientation_to_link) ** 0.5
+        if abs(norm - 1.0) > UNIT_TOLERANCE:
+            raise ValueError(f"orientation_to_link has the norm {norm:g}, expected a unit quaternion (w, x, y, z)")
+        return self
+
+
 class Safety(Model):
     """What the HAL does by itself, whatever the controller says."""
 
@@ -203,6 +228,8 @@ class RobotDescription(Model):
     """Shapes of links, for the controller's collision avoidance."""
     collision_pairs: tuple[tuple[str, str], ...] = ()
     """Names of capsules that are kept apart; every capsule is also kept from the obstacles that a scenario names."""
+    contact_boxes: tuple[LinkBox, ...] = ()
+    """Shapes that the simulated robot touches obstacles and itself with, beside the primitives of the URDF."""
     gravity_in_world: Vector3 = (0.0, 0.0, -9.81)
     safety: Safety = Safety()
 
@@ -235,6 +262,7 @@ class RobotDescription(Model):
         _refuse_twice("sensor", [sensor.name for sensor in sensors])
         capsules = [capsule.name for capsule in self.capsules]
         _refuse_twice("capsule", capsules)
+        _refuse_twice("contact box", [box.name for box in self.contact_boxes])
         for pair in self.collision_pairs:
             for capsule in pair:
                 if capsule not in capsules:

@@ -29,6 +29,21 @@ class Friction(Model):
     """v_s [rad/s] of the motor."""
 
 
+class DriveAsymmetry(Model):
+    """What a drive's closed firmware does beside its PD law: gains that depend on the sign of the velocity.
+
+    Section 3.2.1 of [Del Prete 2016] found this on HRP-2. With σ = tanh(q̇/v₀) the position law becomes
+    k_p (1 + α_p σ) (q_t − q) + k_d (1 + α_d σ) (q̇_t − q̇).
+    """
+
+    position_gain: Annotated[float, Field(gt=-1.0, lt=1.0)] = 0.0
+    """α_p."""
+    velocity_gain: Annotated[float, Field(gt=-1.0, lt=1.0)] = 0.0
+    """α_d."""
+    smoothing_velocity: PositiveFloat = 0.02
+    """v₀ [rad/s] at the joint."""
+
+
 class SensorNoise(Model):
     """Standard deviations of white noise, and of biases drawn once a run; zero is a clean signal."""
 
@@ -53,6 +68,7 @@ class PlantConfig(Model):
     """Every link's mass (and inertia) is multiplied by 1 ± this, the sign drawn from the seed."""
     dead_zone_scale: NonNegative = 1.0
     """True dead zone over the described one."""
+    drive_asymmetry: DriveAsymmetry = DriveAsymmetry()
     friction: Friction = Friction()
     friction_error: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     """Every joint's friction (Coulomb, breakaway, viscous) is multiplied by a factor within 1 ± this, uniform, drawn

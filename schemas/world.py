@@ -42,7 +42,7 @@ class Pole(Model):
 
 
 class Box(Model):
-    """A fixed rigid box."""
+    """A rigid box that is fixed, or stands on springs: what gives way under a foot is rarely nothing."""
 
     kind: Literal["box"] = "box"
     name: Name
@@ -53,6 +53,10 @@ class Box(Model):
     orientation_to_world: Quaternion = (1.0, 0.0, 0.0, 0.0)
     friction: NonNegative = 0.5
     """Coefficient μ of dry friction between it and any link."""
+    stiffness: PositiveFloat | None = None
+    """[N/m] of its springs along each axis of the world, damped to half the critical; it does not turn. None: fixed."""
+    mass: PositiveFloat = 5.0
+    """[kg] on the springs, which carry its weight beforehand."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -2,7 +2,9 @@
 
     τ = D(k_p (q_t − q) + k_d (q̇_t − q̇)) clipped to ± torque limit,   D(x) = sign(x) max(|x| − d, 0)
 
-D is the dead zone that drive and motor current leave around zero [Del Prete 2016]; the master's target has q̇_t = 0.
+D is the dead zone that drive and motor current leave around zero [Del Prete 2016]. While q_t moves between two
+set-points q̇_t is its slope, or zero for drives whose law has none (`Drive.velocity_reference`); the master's holding
+target has q̇_t = 0 either way.
 """
 
 from __future__ import annotations

@@ -129,8 +129,65 @@ def test_what_is_forgotten_starts_from_where_the_robot_is(arm: Robot) -> None:
     [
         ({"mode": "servo"}, "phases.0.mode: servo is not possible on joint joint0"),
         ({"mode": "torque", "hand_path": {"diameter_m": 0.1, "lap_s": 2.0, "laps": 2}}, "longer than the phase"),
+        (
+            {"mode": "position", "joint_path": {"points": [{"time_s": 3.5, "posture": {"joint1": 0.1}}]}},
+            "phases.0.joint_path: its last point is at 3.5 s, after the phase's duration_s 3",
+        ),
+        (
+            {
+                "mode": "position",
+                "joint_sines": {"joints": {"joint1": {"amplitude": 0.1, "frequency_hz": 1}}, "fade_s": 1.6},
+            },
+            "phases.0.joint_sines: two ramps of fade_s 1.6 s do not fit",
+        ),
     ],
 )
 def test_phases_that_do_not_fit_are_refused(run_of: Callable[..., Run], phase: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         Controller(run_of({"phases": [{"name": "x", "duration_s": 3.0} | phase]}), "s")
+
+
+SPLINE = {"points": [{"time_s": 0.1, "posture": {"joint5": -0.4}}, {"time_s": 0.18, "posture": {"joint2": 0.2}}]}
+SINES = {"joints": {"joint4": {"amplitude": 0.2, "frequency_hz": 20.0}}, "fade_s": 0.05}
+MOTIONS = ControllerConfig.model_validate(
+    {
+        "phases": [
+            {"name": "reach", "mode": "position", "duration_s": 0.1, "posture": {"joint5": -0.5}},
+            {"name": "path", "mode": "position", "duration_s": 0.2, "joint_path": SPLINE},
+            {"name": "swing", "mode": "position", "duration_s": 0.2, "joint_sines": SINES},
+            {"name": "torque", "mode": "position", "duration_s": 0.1, "torque_control": True},
+            {"name": "rest", "mode": "position", "duration_s": 0.1},
+        ]
+    }
+)
+
+
+def test_joint_motions_follow_one_another_without_a_jump_and_leave_the_hand_free(arm: Robot) -> None:
+    schedule, references = Schedule(arm.description, MOTIONS.phases), References(arm.description)
+    now = RobotModel(arm, ("hand",)).configure(np.zeros(9), np.zeros(9))
+    targets = [references.advance(schedule.at(k), now) for k in range(350)]
+    posture = np.array([each.posture.position for each in targets])
+    velocity = np.array([each.posture.velocity for each in targets])
+    assert np.abs(np.diff(posture, axis=0)).max() < 0.06
+    assert posture[1:] - posture[:-1] == pytest.approx(0.002 * 0.5 * (velocity[1:] + velocity[:-1]), abs=2e-3)
+    assert posture[150] == pytest.approx(np.where(np.arange(9) == 5, -0.4, np.where(np.arange(9) == 2, 0.2, 0.0)))
+    assert np.abs(posture[150:250, 4]).max() > 0.1
+    assert posture[250:] == pytest.approx(np.tile(posture[150], (100, 1)), abs=1e-9)
+    assert [k for k, each in enumerate(targets) if each.hand is not None] == list(range(300, 350))
+    assert references.take_dropped_path() is None
+
+
+@pytest.mark.parametrize(("phase", "late", "name"), [(1, 60, "path"), (2, 160, "swing")])
+def test_a_motion_of_the_joints_that_is_entered_late_is_left_out_and_told(
+    arm: Robot, phase: int, late: int, name: str
+) -> None:
+    """After a hold: the joints stay where the robot is, until the next phase."""
+    schedule, references = Schedule(arm.description, MOTIONS.phases), References(arm.description)
+    now = RobotModel(arm, ("hand",)).configure(np.linspace(-0.1, 0.1, 9), np.zeros(9))
+    assert schedule.at(late).index == phase
+    for k in range(late, 50 * 2 * phase + 49):
+        target = references.advance(schedule.at(k), now).posture
+        assert np.array_equal(target.position, now.position)
+        assert not target.velocity.any()
+    assert references.take_dropped_path() == name
+    assert references.take_dropped_path() is None

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from controller_service.controller import STOP_DAMPING, STOP_DECAY_S, STOP_S, Stage
+from controller_service.braking import STOP_DAMPING, STOP_DECAY_S, STOP_S
+from controller_service.controller import Stage
 from controller_service.errors import ContactError, QpError, StateError
 from controller_service.model import Array, RobotModel
 from controller_service.qp import QpSolution

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from deploy.metrics import missed_commands, mode_changes, tracking_error
+from deploy.offset_series import MotionSeries, OffsetSeries
 from deploy.series import TraceSeries, TruthSeries
 
 
@@ -15,6 +16,8 @@ def truth(mode: list[int], substeps: list[list[float]], position: list[float]) -
         sequence=np.arange(k),
         time_s=np.arange(k) * 0.002,
         position=np.array(position)[:, None],
+        velocity=np.zeros((k, 1)),
+        joint_torque=np.zeros((k, 1)),
         mode=np.array(mode)[:, None],
         motor_torque_substeps=np.array(substeps)[:, :, None],
         hand=np.zeros((k, 3)),
@@ -45,6 +48,10 @@ def trace(phase: list[str], torque_mode: list[bool], desired: list[list[float]])
         position_reference=empty,
         hand_desired=np.array(desired),
         orientation_desired=np.tile([1.0, 0.0, 0.0, 0.0], (k, 1)),
+        wrench_estimated=np.zeros((k, 6)),
+        wrench_reference=np.zeros((k, 6)),
+        estimated=MotionSeries(0.0, *[empty] * (len(fields(MotionSeries)) - 1)),
+        offset=OffsetSeries(*[empty] * len(fields(OffsetSeries))),
     )
 
 

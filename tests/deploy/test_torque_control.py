@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller_service.controller import STOP_S
+from controller_service.braking import STOP_S
 from controller_service.errors import ContactError
 from deploy.inprocess import InProcess
 from deploy.runner import run_to_log

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from deploy.series import RunSeries, StateSeries, TraceSeries, TruthSeries
-from schemas.load import load_run
+from deploy.offset_series import MotionSeries, OffsetSeries
+from deploy.series import Array, RunSeries, StateSeries, TraceSeries, TruthSeries
+from schemas.load import Run, load_run
 from schemas.messages import ContactSample
 
 RATE_HZ = 50
@@ -41,13 +42,49 @@ def made_up(scenario: str, torque: float = 10.0, way: float = 0.1, **overrides: 
     trace = TraceSeries(
         sequence, time_s, tuple("hold" for _ in time_s), in_torque, zeros, zeros, windup, np.minimum(windup, 18.0),
         zeros + 18.0, np.ones(count), (time_s > 9.5) & (time_s < 12.0), zeros, zeros, hand + 0.002, upright,
+        *no_position_interface(count, n),
     )  # fmt: skip
     truth = TruthSeries(
-        sequence, time_s, position, zeros.astype(np.int64) + 10, np.zeros((count, 1, n)), hand, upright,
+        sequence, time_s, position, zeros, zeros, zeros.astype(np.int64) + 10, np.zeros((count, 1, n)), hand, upright,
         {"hand": hand, **{name: 0.5 * hand for name in run.scenario.plant.truth_frames}}, forces, contacts, 1.0 + swing,
     )  # fmt: skip
-    state = StateSeries(sequence, time_s, position, zeros, np.column_stack((force, np.zeros((count, 3)))))
+    wrench = np.column_stack((force, np.zeros((count, 3))))
+    state = StateSeries(sequence, time_s, position, zeros, wrench, wrench * np.nan, zeros * np.nan)
     return RunSeries(run, True, state, sequence, trace, truth, (), ())
+
+
+def no_position_interface(count: int, n: int) -> tuple[Array, Array, MotionSeries, OffsetSeries]:
+    """Wrenches, estimates and parts of Δq of a run without torque control through the position interface."""
+    wrench, absent = np.full((count, 6), np.nan), np.full((count, n), np.nan)
+    return wrench, wrench, MotionSeries(0.0, *(absent,) * 4), OffsetSeries(*(absent,) * 9)
+
+
+def made_up_leg(run: Run, desired: Array, position: Array, **truth: Any) -> RunSeries:
+    """A run of leg6 that never was, every cycle of it under torque control.
+
+    Args:
+        run: what ran.
+        desired: q^d (K, n) [rad].
+        position: true q (K, n) [rad].
+        truth: fields of `TruthSeries` that are not zero.
+
+    """
+    count, n = desired.shape
+    zeros, sequence = np.zeros((count, n)), np.arange(count)
+    time_s = sequence * run.robot.description.period_s
+    absent, wrench = zeros * np.nan, np.zeros((count, 6))
+    upright = np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    trace = TraceSeries(
+        sequence, time_s, ("",) * count, np.zeros(count, np.bool_), zeros, zeros, absent, absent, absent,
+        np.zeros(count), np.zeros(count, np.bool_), zeros, desired, wrench[:, :3], upright, wrench, wrench,
+        MotionSeries(0.0395, *(zeros,) * 4), OffsetSeries(desired, *(zeros,) * 8),
+    )  # fmt: skip
+    true = TruthSeries(
+        sequence, time_s, position, zeros, zeros, zeros.astype(np.int64) + 8, zeros[:, np.newaxis], wrench[:, :3],
+        upright, {}, {}, ((),) * count, np.zeros(count),
+    )  # fmt: skip
+    state = StateSeries(sequence, time_s, position, absent, wrench, wrench, zeros)
+    return RunSeries(run, True, state, sequence, trace, replace(true, **truth), (), ())
 
 
 def _contacts(time_s: float) -> tuple[ContactSample, ...]:
@@ -62,7 +99,8 @@ def nothing_known(series: RunSeries) -> RunSeries:
     """The same run without truth and sensor, as on a robot that has neither, and not in torque mode."""
     truth, trace = series.truth, series.trace
     none = TruthSeries(
-        truth.sequence[:0], truth.time_s[:0], truth.position[:0], truth.mode[:0], truth.motor_torque_substeps[:0],
+        truth.sequence[:0], truth.time_s[:0], truth.position[:0], truth.velocity[:0], truth.joint_torque[:0],
+        truth.mode[:0], truth.motor_torque_substeps[:0],
         truth.hand[:0], truth.hand_orientation[:0], {}, {}, (), truth.kinetic_energy[:0],
     )  # fmt: skip
     blank = replace(

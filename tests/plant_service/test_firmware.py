@@ -1,4 +1,4 @@
-"""Drive firmware: the law in its closed form, CSP interpolation, limits, holding, encoder and reported torque."""
+"""Drive firmware: the law in its closed form, interpolation, asymmetry, limits, holding, encoder, reported torque."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from plant_service.firmware import Firmware
 from plant_service.joint_axis import JointAxis
 from schemas.load import load_robot
 from schemas.robot import RobotDescription
-from schemas.scenario import PlantConfig, SensorNoise
+from schemas.scenario import DriveAsymmetry, PlantConfig, SensorNoise
 
 NO_LIMIT = 60000
 PLAIN = PlantConfig()
@@ -37,8 +37,8 @@ GAINS = law.FirmwareGains.of(ROBOT)
 class Bench:
     """Firmware on joints that stand where the test puts them."""
 
-    def __init__(self, config: PlantConfig = PLAIN, seed: int = 0) -> None:
-        self.firmware = Firmware(ROBOT, config, seed)
+    def __init__(self, config: PlantConfig = PLAIN, seed: int = 0, robot: RobotDescription | None = None) -> None:
+        self.firmware = Firmware(robot or ROBOT, config, seed)
         self.axes = [JointAxis(self.firmware, joint) for joint in range(9)]
         generator = np.random.default_rng(1)
         self.position, self.velocity = generator.uniform(-1.0, 1.0, 9), generator.normal(scale=0.01, size=9)
@@ -86,6 +86,105 @@ def test_entry_jumps_then_targets_are_interpolated() -> None:
     assert stale[0] == pytest.approx(
         law.position_torque(second, np.zeros(9), bench.encoder, bench.velocity, GAINS), abs=1e-9
     )
+
+
+def test_where_the_law_knows_no_slope_targets_still_move_linearly_but_the_target_velocity_is_zero() -> None:
+    """Every third drive: τ of the moving target with q̇_t = 0; the others as ever."""
+    zero = np.arange(9) % 3 == 0
+    joints = tuple(
+        joint.model_copy(update={"drive": joint.drive.model_copy(update={"velocity_reference": "zero"})})
+        if each
+        else joint
+        for joint, each in zip(ROBOT.joints, zero, strict=True)
+    )
+    bench = Bench(robot=ROBOT.model_copy(update={"joints": joints}))
+    first = bench.follow(bench.position + 0.001)
+    bench.period()
+    second = bench.follow(bench.position + 0.0015)
+    slope = np.where(zero, 0.0, (second - first) / ROBOT.period_s)
+    for index, row in enumerate(bench.period()):
+        target = first + (second - first) * index / 4.0
+        assert row == pytest.approx(law.position_torque(target, slope, bench.encoder, bench.velocity, GAINS), abs=1e-9)
+
+
+ALPHA_P, ALPHA_D = -0.3, 0.4
+ASYMMETRIC = PlantConfig(drive_asymmetry=DriveAsymmetry(position_gain=ALPHA_P, velocity_gain=ALPHA_D))
+
+
+def at_sigma(sigma: np.ndarray) -> law.FirmwareGains:
+    """k_p (1 + α_p σ) and k_d (1 + α_d σ)."""
+    return law.FirmwareGains(
+        GAINS.position_gain * (1.0 + ALPHA_P * sigma),
+        GAINS.velocity_gain * (1.0 + ALPHA_D * sigma),
+        GAINS.dead_zone,
+        GAINS.torque_limit,
+    )
+
+
+def test_asymmetric_gains_follow_the_true_velocity_of_every_step() -> None:
+    bench = Bench(ASYMMETRIC)
+    first = bench.follow(bench.position + 0.0002)
+    bench.period()
+    second = bench.follow(bench.position + 0.00022)
+    slope = (second - first) / ROBOT.period_s
+    bench.firmware.begin_period()
+    for index in range(4):
+        velocity = np.linspace(-0.05, 0.05, 9) * (index + 1) / 4.0
+        target = first + (second - first) * index / 4.0
+        gains = at_sigma(np.tanh(velocity / 0.02))
+        expected = law.position_torque(target, slope, bench.encoder, velocity, gains)
+        assert np.abs(expected).max() < GAINS.torque_limit.min()
+        assert bench.firmware.step(index, bench.position, velocity) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 0.0, 1.0])
+def test_far_from_rest_the_gains_are_those_of_the_direction_and_at_rest_the_described_ones(sign: float) -> None:
+    bench = Bench(ASYMMETRIC)
+    bench.velocity[:] = 0.5 * sign  # 25 v₀
+    target = bench.follow(bench.position + 0.001)
+    expected = law.position_torque(target, np.zeros(9), bench.encoder, bench.velocity, at_sigma(np.full(9, sign)))
+    assert bench.period()[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_without_asymmetry_the_bits_are_those_of_the_plain_law() -> None:
+    other = PlantConfig(drive_asymmetry=DriveAsymmetry(smoothing_velocity=3.0))
+    rows = []
+    for config in (PLAIN, other, ASYMMETRIC):
+        bench = Bench(config)
+        bench.follow(bench.position + 0.0003)
+        first = bench.period()
+        bench.follow(bench.position + 0.0004)
+        rows.append((first.tobytes(), bench.period().tobytes()))
+    assert rows[0] == rows[1]
+    assert rows[0] != rows[2]
+
+
+def test_asymmetry_leaves_torque_mode_alone_beside_a_position_loop() -> None:
+    rows = []
+    for config in (PLAIN, ASYMMETRIC):
+        bench = Bench(config)
+        bench.follow(bench.position + 0.0003)
+        for axis in bench.axes[:6]:
+            axis.follow_torque(123, NO_LIMIT)
+        rows.append(bench.period())
+    assert rows[0][:, :6].tobytes() == rows[1][:, :6].tobytes()
+    assert (np.abs(rows[0] - rows[1])[:, 6:].max(axis=0) > 1e-3).all()
+
+
+@pytest.mark.parametrize("per_mille", [-700, 40, 900])
+def test_an_asymmetric_drive_holds_by_its_own_law(per_mille: int) -> None:
+    """No jump at the start, where the gains of the velocity count; at the end the law about the position."""
+    bench = Bench(ASYMMETRIC)
+    gains = at_sigma(np.tanh(bench.velocity / 0.02))
+    for axis in bench.axes:
+        axis.follow_torque(per_mille, NO_LIMIT)
+    last = bench.period()[-1]
+    for axis in bench.axes:
+        axis.hold()
+    assert bench.period()[0] == pytest.approx(last, abs=1e-9)
+    rest = [bench.period() for _ in range(110)][-1]
+    expected = law.position_torque(bench.encoder, np.zeros(9), bench.encoder, bench.velocity, gains)
+    assert rest[-1] == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 1.5])

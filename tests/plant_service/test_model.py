@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pinocchio as pin
@@ -12,10 +9,13 @@ import pytest
 
 from plant_service.errors import PlantError
 from plant_service.model import build, reduced
+from schemas.bus_load import cycle_plan
 from schemas.load import Robot, load_robot
+from schemas.robot import LinkBox
 from schemas.scenario import PlantConfig
 
 ROBOT = load_robot("arm9")
+LEG = load_robot("leg6")
 EXACT = PlantConfig(mass_error=0.0)
 
 
@@ -112,16 +112,102 @@ def test_meshes_are_left_out() -> None:
     build(Robot(ROBOT.description, urdf), EXACT, 0)
 
 
+def leg_in_pinocchio() -> pin.Model:
+    """The six joints of leg6, the others of the humanoid locked at zero, without rotors."""
+    whole = pin.buildModelFromXML(LEG.urdf)
+    names = LEG.description.joint_names
+    locked = [whole.getJointId(name) for name in whole.names[1:] if name not in names]
+    return pin.buildReducedModel(whole, locked, pin.neutral(whole))
+
+
 def test_a_leg_of_a_humanoid_with_meshes_builds() -> None:
     """JVRC-1's right leg: MuJoCo cannot read its meshes, and the other 38 joints are locked."""
-    urdf = Path(str(resources.files("jvrc_description"))) / "urdf" / "jvrc1.urdf"
-    names = ("R_HIP_P", "R_HIP_R", "R_HIP_Y", "R_KNEE", "R_ANKLE_R", "R_ANKLE_P")
-    template = ROBOT.description.joints[0]
-    joints = tuple(template.model_copy(update={"name": name}) for name in names)
-    leg = ROBOT.description.model_copy(update={"joints": joints, "force_torque_sensors": ()})
-    plant = build(Robot(leg, urdf.read_text(encoding="utf-8")), EXACT, 0)
+    plant = build(LEG, EXACT, 0)
     assert plant.model.nv == 6
     assert plant.model.body_mass.sum() == pytest.approx(62.4, abs=0.5)
+    reference, data = leg_in_pinocchio(), mujoco.MjData(plant.model)
+    reference.armature = np.array([j.rotor_inertia * j.gear_ratio**2 for j in LEG.description.joints])
+    q, v = np.array([-0.6, -0.2, 0.1, 1.2, 0.1, -0.5]), np.linspace(-1.0, 1.0, 6)
+    data.qpos[plant.qpos_address], data.qvel[plant.dof_address] = q, v
+    mujoco.mj_forward(plant.model, data)
+    mass = np.zeros((6, 6))
+    mujoco.mj_fullM(plant.model, data, mass)
+    assert mass == pytest.approx(pin.crba(reference, reference.createData(), q), abs=1e-9)
+    assert data.qfrc_bias == pytest.approx(pin.nonLinearEffects(reference, reference.createData(), q, v), abs=1e-9)
+
+
+def test_the_legs_buses_carry_its_plan_and_its_sensor_holds_a_step() -> None:
+    plan = cycle_plan(LEG.description)
+    assert plan.fits
+    assert plan.needed_s <= 0.98 * plan.available_s
+    (sensor,) = LEG.description.force_torque_sensors
+    assert 32767 * sensor.force_resolution > 1000.0
+    assert 32767 * sensor.torque_resolution > 100.0
+
+
+def test_the_legs_ranges_lie_inside_the_stops_and_its_loops_are_damped() -> None:
+    """(k_d + v N²) / (2 √(k_p M)) with the knee stretched, the links and the rotor in M."""
+    plant = build(LEG, EXACT, 0)
+    joints = LEG.description.joints
+    stops = plant.model.jnt_range[[plant.model.joint(joint.name).id for joint in joints]]
+    inside = np.array([(joint.position_min, joint.position_max) for joint in joints]) - stops
+    assert (np.abs(inside - (0.05, -0.05)) < 1.001e-3).all()
+    assert (inside * (1.0, -1.0) >= 0.05).all()
+    reference = leg_in_pinocchio()
+    links = pin.crba(reference, reference.createData(), np.array([0.0, 0.0, 0.0, 0.05, 0.0, 0.0])).diagonal()
+    for joint, link in zip(joints, links.tolist(), strict=True):
+        drive, square = joint.drive, joint.gear_ratio**2
+        damping = drive.velocity_gain + EXACT.friction.viscous * square
+        stiffness_times_inertia = drive.position_gain * (link + joint.rotor_inertia * square)
+        assert 0.6 <= damping / (2.0 * np.sqrt(stiffness_times_inertia)) <= 0.7, joint.name
+        assert 0.010 <= damping / drive.position_gain <= 0.020, joint.name
+
+
+def boxed(*boxes: LinkBox) -> Robot:
+    """leg6 with these contact boxes alone."""
+    return Robot(LEG.description.model_copy(update={"contact_boxes": boxes}), LEG.urdf)
+
+
+def knee_box(name: str, link: str, z: float) -> LinkBox:
+    return LinkBox(name=name, link=link, position_in_link=(0.0, 0.0, z), half_sizes=(0.04, 0.04, 0.1))
+
+
+def test_a_contact_box_has_its_place_and_no_mass() -> None:
+    half = np.sqrt(0.5)
+    box = LinkBox(
+        name="shin",
+        link="R_KNEE_S",
+        position_in_link=(0.1, 0.02, -0.2),
+        half_sizes=(0.01, 0.02, 0.15),
+        orientation_to_link=(half, 0.0, half, 0.0),
+    )
+    bare, with_box = (build(robot, EXACT, 0).model for robot in (boxed(), boxed(box)))
+    assert (bare.ngeom, with_box.ngeom) == (0, 1)
+    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        assert (getattr(bare, field) == getattr(with_box, field)).all()
+    (geom,) = (with_box.geom(index) for index in range(with_box.ngeom))
+    assert with_box.body(geom.bodyid.item()).name == "R_KNEE_S"
+    assert geom.type == mujoco.mjtGeom.mjGEOM_BOX
+    assert geom.size.tolist() == [0.01, 0.02, 0.15]
+    assert geom.pos == pytest.approx([0.1, 0.02, -0.2])
+    assert geom.quat == pytest.approx([half, 0.0, half, 0.0])
+
+
+def test_contact_boxes_of_neighbours_do_not_collide_and_those_of_others_do() -> None:
+    """The box that reaches over the knee from the thigh, and the same shape on the link above the thigh."""
+    shank = knee_box("shank", "R_KNEE_S", -0.05)
+    for link, touches in (("R_HIP_Y_S", False), ("R_HIP_R_S", True)):
+        plant = build(boxed(shank, knee_box("upper", link, -0.389)), EXACT, 0)
+        data = mujoco.MjData(plant.model)
+        data.qpos[plant.qpos_address] = plant.initial_position
+        mujoco.mj_forward(plant.model, data)
+        assert (data.ncon > 0) == touches
+
+
+def test_a_contact_box_on_an_unknown_link_is_refused() -> None:
+    robot = boxed(knee_box("shank", "R_KNEE_S", 0.0), knee_box("nose", "NOSE_S", 0.0))
+    with pytest.raises(PlantError, match=r"contact_boxes\.1\.link: leg6 has no link 'NOSE_S'; it has .*R_KNEE_S"):
+        build(robot, EXACT, 0)
 
 
 @pytest.mark.parametrize(

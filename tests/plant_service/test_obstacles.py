@@ -206,3 +206,91 @@ def test_a_robot_without_shapes_cannot_have_obstacles() -> None:
     Simulation(bare, PlantConfig(initial_posture=POSE), 0)
     with pytest.raises(PlantError, match=r"plant\.world\.obstacles: no moving link of arm9 has a collision shape"):
         Simulation(bare, config(pole()), 0)
+
+
+LEG = load_robot("leg6")
+SQUAT = {"R_HIP_P": -0.6, "R_KNEE": 1.2, "R_ANKLE_P": -0.6}
+SOLE_Z = -0.1077
+"""Of the lowest face of the contact box in the foot's frame, level in this posture."""
+
+
+def on_floor(depth: float) -> PlantConfig:
+    """leg6 over a floor that its sole is `depth` deep in."""
+    foot = np.array(
+        Simulation(LEG, PlantConfig(initial_posture=SQUAT, mass_error=0.0), 0).pose("R_ANKLE_P_S").position_in_world
+    )
+    top = foot[2] + SOLE_Z + depth
+    floor = Box(name="floor", position_in_world=(foot[0], foot[1], top - 0.05), half_sizes=(0.5, 0.5, 0.05))
+    return PlantConfig(initial_posture=SQUAT, mass_error=0.0, world=World(obstacles=(floor,)))
+
+
+def test_the_sole_of_a_link_with_a_mesh_stands_on_the_floor_and_the_sensor_carries_it() -> None:
+    """At rest the sensor's wrench is the negative of the floor's force and of the foot's weight."""
+    simulation = Simulation(LEG, on_floor(-0.002), 0)
+    start = [axis.position_counts() for axis in simulation.axes]
+    turn = 4096 * 160 / (2.0 * np.pi)
+    # The leg stretches by some 6 mm with the sole level, 4 mm into the floor by its targets.
+    way = np.array([0.015, 0.0, 0.0, -0.03, 0.0, 0.015]) * turn
+    for cycle in range(1000):
+        for joint, axis in enumerate(simulation.axes):
+            axis.follow_position(start[joint] + round(way[joint] * min(cycle / 300.0, 1.0)), 3000)
+        simulation.advance()
+        truth = simulation.truth(cycle, ())
+    (contact,) = truth.contacts
+    assert (contact.link, contact.other) == ("R_ANKLE_P_S", "floor")
+    assert np.abs(truth.velocity).max() < 1e-5
+    foot, to_world = simulation.pose("R_ANKLE_P_S"), np.zeros(9)
+    mujoco.mju_quat2Mat(to_world, np.array(foot.orientation_to_world))
+    force, weight = np.array(contact.force_in_world), np.array([0.0, 0.0, -1.5 * 9.81])
+    assert force[2] > 20.0
+    read, moment = (to_world.reshape(3, 3) @ each for each in truth.sensor_wrenches["ankle"])
+    assert read == pytest.approx(-(force + weight), abs=1e-3)
+    arm, centre = np.array(contact.position_in_world) - foot.position_in_world, np.array([0.03, 0.0, -0.07])
+    expected = -np.cross(arm, force) - np.cross(to_world.reshape(3, 3) @ centre, weight)
+    assert moment == pytest.approx(expected, abs=1e-3 * float(np.linalg.norm(expected)))
+
+
+@pytest.mark.parametrize("depth", [0.003, 0.01])
+def test_a_floor_that_the_sole_starts_in_is_refused_with_the_depth(depth: float) -> None:
+    with pytest.raises(PlantError, match=r"obstacles\.0: floor is .* mm deep in link R_ANKLE_P_S of leg6") as caught:
+        Simulation(LEG, on_floor(depth), 0)
+    told = float(str(caught.value).split(" is ")[1].split(" mm")[0])
+    assert told == pytest.approx(1000.0 * depth, rel=0.01)
+
+
+def test_a_leg_of_meshes_alone_is_told_to_have_contact_boxes() -> None:
+    bare = Robot(LEG.description.model_copy(update={"contact_boxes": ()}), LEG.urdf)
+    with pytest.raises(PlantError, match=r"no moving link of leg6 has a collision shape.*contact_boxes"):
+        Simulation(bare, on_floor(-0.002), 0)
+
+
+def block_position(simulation: Simulation) -> np.ndarray:
+    """How far the springs have let a box go [m]; its joints come after the robot's."""
+    model, data = simulation.plant.model, simulation._data
+    body = model.body("obstacle/table")
+    return np.array(data.xpos[body.id])
+
+
+@pytest.mark.parametrize("stiffness", [1e5, 1e6])
+def test_a_box_on_springs_gives_way_by_force_over_stiffness(stiffness: float) -> None:
+    """Under the hand's push; its own weight is carried. Along the surface the contact still creeps a little."""
+    soft = table().model_copy(update={"stiffness": stiffness, "mass": 3.0})
+    simulation = Simulation(ROBOT, config(soft), 0)
+    simulation.advance()
+    assert np.abs(block_position(simulation)).max() < 1e-9
+    truth = lowered(simulation, 750)[-1]
+    (contact,) = truth.contacts
+    force = -np.array(contact.force_in_world)
+    assert force[2] < -50.0
+    assert block_position(simulation)[2] == pytest.approx(force[2] / stiffness, rel=1e-3)
+    assert block_position(simulation) == pytest.approx(force / stiffness, rel=0.1, abs=1e-6)
+
+
+def test_a_box_on_springs_keeps_its_contact_from_substep_to_substep() -> None:
+    """Once the blow is over, no period is without contact while the hand presses on and slides."""
+    soft = table(0.3).model_copy(update={"stiffness": 1e6})
+    simulation = Simulation(ROBOT, config(soft), 0)
+    forces = np.array([truth.contact_force for truth in lowered(simulation, 500, speed=0.4)])
+    large = np.flatnonzero(forces > 50.0)
+    assert large.size > 100
+    assert (forces[large[0] + 50 :] > 0.0).all()

@@ -23,6 +23,8 @@ from schemas.messages import (
     HalStatus,
     ImuSample,
     JointCommand,
+    MotionTrace,
+    OffsetTrace,
     OperatorRequest,
     PlantTruth,
     PoseSample,
@@ -41,6 +43,16 @@ poses = st.builds(PoseSample, position_in_world=triples, orientation_to_world=qu
 names = st.text(max_size=12)
 modes = st.sampled_from(ControlMode)
 applied = st.builds(AppliedCommand, sequence=sequences, mode=modes, position=st.none() | vectors, torque=vectors)
+estimates = st.builds(
+    MotionTrace,
+    delay_s=numbers,
+    **{name: vectors for name in MotionTrace.model_fields if name != "delay_s"},
+)
+offsets = st.builds(
+    OffsetTrace,
+    **{name: vectors for name in OffsetTrace.model_fields if name != "limited"},
+    limited=st.lists(names, max_size=2).map(tuple),
+)
 common: dict[str, Any] = {"sequence": sequences, "time_ns": times}
 MESSAGES: dict[type[Model], st.SearchStrategy[Model]] = {
     RobotState: st.builds(
@@ -84,6 +96,8 @@ MESSAGES: dict[type[Model], st.SearchStrategy[Model]] = {
         qp_primal_residual=numbers,
         qp_dual_residual=numbers,
         qp_status=names,
+        estimated=st.none() | estimates,
+        offset=st.none() | offsets,
     ),
     PlantTruth: st.builds(
         PlantTruth,

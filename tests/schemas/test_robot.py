@@ -1,4 +1,4 @@
-"""Bus lines: which wire a run is made on, for the HAL and for the plant, and nothing else."""
+"""Bus lines: which wire a run is made on, for HAL and plant, and nothing else; heartbeats, contact boxes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from schemas.errors import ConfigurationError
 from schemas.load import rewire
 from schemas.log import RunRecord
-from schemas.robot import BUS_LINES, Bus, Safety
+from schemas.robot import BUS_LINES, Bus, LinkBox, Safety
 from schemas.service import session_identity
 
 
@@ -109,3 +109,30 @@ def test_a_heartbeat_that_its_objects_cannot_hold_is_refused(heartbeat_s: float)
 
 def test_three_of_the_longest_heartbeats_fit_the_consumer_object() -> None:
     assert 3000.0 * Safety(heartbeat_s=21.0).heartbeat_s < 2**16
+
+
+BOX = {"name": "sole", "link": "hand", "position_in_link": (0.0, 0.0, 0.1), "half_sizes": (0.1, 0.05, 0.01)}
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"orientation_to_link": (1.0, 1.0, 0.0, 0.0)}, "orientation_to_link has the norm 1.41421"),
+        ({"orientation_to_link": (0.0, 0.0, 0.0, 0.0)}, "orientation_to_link has the norm 0"),
+        ({"half_sizes": (0.1, 0.0, 0.1)}, "half_sizes"),
+        ({"name": ""}, "name"),
+    ],
+)
+def test_contact_boxes_without_shape_orientation_or_name_are_refused(fields: dict[str, Any], expected: str) -> None:
+    LinkBox(**BOX | {"orientation_to_link": (0.6, 0.0, 0.8, 0.0)})
+    with pytest.raises(ValidationError) as caught:
+        LinkBox(**BOX | fields)
+    assert expected in str(caught.value)
+
+
+def test_two_contact_boxes_of_one_name_are_refused(files: Any) -> None:
+    files.robot["contact_boxes"] = [BOX]
+    assert files.load().robot.description.contact_boxes == (LinkBox(**BOX),)
+    files.robot["contact_boxes"] = [BOX, BOX | {"link": "chest"}]
+    with pytest.raises(ConfigurationError, match="contact box 'sole' is given twice"):
+        files.load()
