@@ -147,7 +147,8 @@ class Controller:
             StateError: out of sequence, wrong number of joints, not finite, or without the motor torque that torque
                 mode starts from.
             ControllerError: a command that is not finite; a QP without solution, a contact that is to stop the robot, a
-                silent sensor: in torque mode these come after the robot was brought to rest.
+                silent sensor: in torque mode these come after the robot was brought to rest. Through the position
+                interface, where a joint may be too fast as well, they come at once: the HAL holds the last target.
 
         """
         measured, cycles = self._order.accept(state)
@@ -215,6 +216,7 @@ class Controller:
             self._leave_interface(elapsed_s)
         else:
             self._references.forget()
+            self._fade.stop()
             if before is Stage.HOLD:
                 self._position = _firmware_target(state)
             elif before is Stage.TORQUE:
@@ -252,6 +254,7 @@ class Controller:
             if before is Stage.POSITION:
                 position = self._fade.advance(self._ahead((cycles + 1) * self._period)[0], cycles * self._period)
             given = self._interface.start(position, now, time, targets, state, cycles)
+            self._fade.stop()
         self._position, self._velocity = targets.posture.position, targets.posture.velocity
         self._given = given.command
         motion, posture = given.motion, targets.posture
@@ -275,8 +278,11 @@ class Controller:
 
     def _capture(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
         """First step of the transition: the target stands still, QP and tasks get the measured configuration."""
-        self._position = self._ahead(elapsed_s)[0] if before is Stage.POSITION else _firmware_target(state)
+        self._position = _firmware_target(state)
+        if before is Stage.POSITION:
+            self._position = self._fade.advance(self._ahead(elapsed_s)[0], elapsed_s)
         self._velocity = np.zeros(self._n)
+        self._fade.stop()
         now = self._model.configure(estimate.position, estimate.velocity)
         self._references.forget()
         return self._position_tick(self._still_mode, now, self._plan(now, time, state), self._position)

@@ -88,7 +88,8 @@ class MotionSensing:
     @property
     def ready(self) -> bool:
         """Enough has been seen of every sensor since the start for the estimates to be of use."""
-        return self._filters.ready and (not self._used or self._filters.sensors_ready)
+        heard = not self._used or (self._filters.sensors_ready and self.silent is None)
+        return self._filters.ready and heard
 
     def update(self, state: RobotState, position: Array, cycles: int) -> MotionEstimate:
         """Estimate at a state; `position` (n,) [rad] is its measured one, `cycles` after the last state.
@@ -99,9 +100,9 @@ class MotionSensing:
         base, value = self._rest, self._readings
         if self._used:
             self._read(state, cycles)
-        if self._used and len(self._ages) == len(self._used):
-            if self.silent is not None:
-                self._filters.forget_sensors()
+        if self.silent is not None:
+            self._filters.forget_sensors()
+        elif self._used and len(self._ages) == len(self._used):
             value, rate = self._filters.sensors(self._readings, cycles)
             if self._imu_kinematics is not None:
                 base = self._imu_kinematics.base_motion(q, velocity, acceleration, value[:3], rate[:3], value[3:6])
@@ -121,11 +122,16 @@ class MotionSensing:
             contact: Jᵀ f̂ (n,) [N·m].
 
         """
-        target = np.array(state.position_measured if state.applied.position is None else state.applied.position)
-        before = target if self._last_target is None else self._last_target
-        self._last_target = target
-        ahead = motion.position + (0.5 * self._period) * motion.velocity
-        torque = self._motors.torque(0.5 * (target + before) - ahead, motion.velocity)
+        applied, motors = state.applied, self._motors
+        if applied.torque is not None:  # drives in torque mode, which no offset moves
+            self._last_target = None
+            torque = np.array(applied.torque) - motors.friction(motion.velocity) / motors.torque_gain
+        else:
+            target = np.array(state.position_measured if applied.position is None else applied.position)
+            before = target if self._last_target is None else self._last_target
+            self._last_target = target
+            ahead = motion.position + (0.5 * self._period) * motion.velocity
+            torque = motors.torque(0.5 * (target + before) - ahead, motion.velocity)
         acceleration = np.asarray(np.linalg.solve(now.mass, torque - now.nonlinear + contact), np.float64)
         self._filters.predict(acceleration)
 

@@ -22,6 +22,7 @@ from controller_service.schedule import PhaseTime, Targets
 from controller_service.task_set import TaskSet
 from controller_service.tasks import PostureTarget
 from schemas.control_law import PositionTorque, SineWrench
+from schemas.errors import ConfigurationError
 from schemas.load import Run
 from schemas.messages import RobotState
 from schemas.robot import RobotDescription
@@ -47,7 +48,7 @@ class InterfaceTick:
     """f^d (6,)."""
     motion: ReferenceMotion
     torque: Array
-    """τ* (n,) [N·m]."""
+    """τ* (n,) [N·m], before the limit of Δq."""
     command: Array
     """(n,) [rad], within range and speed limits."""
     limited: tuple[str, ...]
@@ -121,7 +122,7 @@ class PositionInterface:
         tasks: makes the QP's.
 
     Raises:
-        ConfigurationError: unknown sensors.
+        ConfigurationError: unknown sensors, a hand that the sensor does not carry.
 
     """
 
@@ -129,11 +130,12 @@ class PositionInterface:
         description = run.robot.description
         n, period = len(description.joints), description.period_s
         self._config, self._qp, self._tasks, self._period = config, qp, tasks, period
-        self._names, self._frame = description.joint_names, description.hand_frame
+        self._model, self._names, self._frame = model, description.joint_names, description.hand_frame
         self._motors = Motors.of(config, description.joint_names)
         self._law = PositionTorqueLaw(config, self._motors, qp.limits.torque)
         self._sensing = MotionSensing(run.robot, model, config, self._motors)
         self._sensor_frame = _sensor_frame(description, config.sensor)
+        self._refuse_hand_before_sensor(model)
         self._past = DelayLine(3 * n + 6, self._sensing.delay_s, period)
         self._lead_s = period * (description.command_delay_cycles + 1) if config.compensate_delay else 0.0
         """A command reaches the drive after the delay and its firmware goes there within one more cycle."""
@@ -144,12 +146,30 @@ class PositionInterface:
         self._high = np.array([joint.position_max for joint in description.joints])
         self._speed = np.array([joint.velocity_limit for joint in description.joints])
         self._step = period * self._speed
-        self._largest = self._motors.largest_offset(qp.limits.torque, self._speed)
+        self._largest = largest_offset(description)
         self._zero, self._no_wrench = np.zeros(n), np.zeros(6)
         self._last_command = self._zero
+        self._running_s = 0.0
+        """Since the start."""
         self._since = self._zero
         """q̇^d less that of `delay_s` ago (n,) [rad/s], of the last state."""
         self._estimate: MotionEstimate | None = None
+
+    def _refuse_hand_before_sensor(self, model: RobotModel) -> None:
+        """Refuse a hand that the sensor does not carry: the wrench that it reads does not act there."""
+        if self._sensor_frame is None or self._frame is None:
+            return
+        joints = [model.model.frames[model.model.getFrameId(name)].parentJoint for name in self.frames]
+        if joints[0] not in list(model.model.subtrees[joints[1]]):
+            raise ConfigurationError(
+                f"controller.position_torque.sensor: the robot's hand_frame {self._frame!r} does not lie beyond the"
+                f" sensor {self._config.sensor!r} (link {self._sensor_frame!r}): what it reads is not the hand's wrench"
+            )
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Hand and sensor."""
+        return tuple(frame for frame in (self._frame, self._sensor_frame) if frame is not None)
 
     @property
     def delay_s(self) -> float:
@@ -179,7 +199,8 @@ class PositionInterface:
         desired = inverse_dynamics(now, acceleration)
         then = self._past.push(np.concatenate((velocity, acceleration, desired, self._no_wrench)), cycles)
         self._since = velocity - then[: len(velocity)]
-        self._model_drives(now, state)
+        if self._sensing.models_drives:
+            self._model_drives(now, state, self._wrench())
 
     def start(
         self, position: Array, now: Configuration, time: PhaseTime, targets: Targets, state: RobotState, cycles: int
@@ -192,6 +213,7 @@ class PositionInterface:
         """
         self._law.reset()
         self._slow.restart()
+        self._running_s = 0.0
         self._last_command = position
         tick = self._compute(now, time, targets, state, cycles)
         self._fade.start(position - tick.command)
@@ -222,6 +244,7 @@ class PositionInterface:
                 f" its limit is {self._speed[worst]:g}. Identify its motor anew, or lower the gains of"
                 " controller.position_torque."
             )
+        self._running_s += cycles * self._period
         tick = self._compute(now, time, targets, state, cycles)
         wanted = self._fade.advance(tick.command, cycles * self._period)
         in_range = np.minimum(np.maximum(wanted, self._low), self._high)
@@ -237,7 +260,10 @@ class PositionInterface:
         """All terms, and the command before its limits."""
         assert self._estimate is not None
         estimate, posture, elapsed_s = self._estimate, targets.posture, cycles * self._period
-        wanted = self._no_wrench if time.phase.wrench is None else desired_wrench(time.phase.wrench, time)
+        wanted = self._no_wrench
+        if time.phase.wrench is not None:
+            # Entered late, as after a hold, it must not be there at once
+            wanted = desired_wrench(time.phase.wrench, min(time.since_start_s, self._running_s), time.left_s)
         jacobian = None if self._frame is None else now.frames[self._frame].jacobian
         motion = self._reference_motion(now, targets, state)
         desired = inverse_dynamics(now, motion.acceleration)
@@ -245,7 +271,7 @@ class PositionInterface:
             desired -= wanted.dot(jacobian)
         then = self._past.push(np.concatenate((posture.velocity, posture.acceleration, desired, wanted)), cycles)
         n = len(self._names)
-        wrench, velocity = self._wrench(estimate, now), now.velocity
+        wrench, velocity = self._wrench(), now.velocity
         self._since = posture.velocity - then[:n]
         if self._config.desired == "qp":
             error = self._slow.pass_on("torque", then[2 * n : 3 * n] - estimate.torque.torque, elapsed_s)
@@ -262,7 +288,8 @@ class PositionInterface:
         of_torque = terms.of_torque
         offset = np.minimum(np.maximum(of_torque + terms.friction, -self._largest), self._largest)
         command = now.position + self._lead_s * velocity + offset
-        self._model_drives(now, state)
+        if self._sensing.models_drives:
+            self._model_drives(now, state, wrench)
         return InterfaceTick(
             estimate, terms, desired, wrench, wanted, motion, of_torque / self._motors.torque_gain, command, ()
         )
@@ -273,20 +300,22 @@ class PositionInterface:
         acceleration = targets.posture.acceleration
         return ReferenceMotion(acceleration, None, QpSolution(acceleration, _NOTHING, 0, "inverse dynamics", 0.0, 0.0))
 
-    def _wrench(self, estimate: MotionEstimate, now: Configuration) -> Array | None:
-        """Move the estimated wrench (6,) from the sensor to the hand's origin, world axes."""
+    def _wrench(self) -> Array | None:
+        """Move the estimated wrench (6,) from the sensor to the hand's origin, world axes, where both were then."""
+        assert self._estimate is not None
         if self._sensor_frame is None or self._frame is None:
             return None
-        sensor, hand = now.frames[self._sensor_frame], now.frames[self._frame]
-        wrench: Array = estimate.torque.external_wrenches[0].reshape(2, 3).dot(sensor.rotation.T).ravel()
-        if sensor is not hand:
-            wrench[3:] += np.cross(sensor.position - hand.position, wrench[:3])
+        at = self._estimate.position
+        position, rotation = self._model.pose(at, self._sensor_frame)
+        wrench: Array = self._estimate.torque.external_wrenches[0].reshape(2, 3).dot(rotation.T).ravel()
+        if self._sensor_frame != self._frame:
+            x, y, z = position - self._model.pose(at, self._frame)[0]
+            fx, fy, fz = wrench[:3].tolist()
+            wrench[3:] += (y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
         return wrench
 
-    def _model_drives(self, now: Configuration, state: RobotState) -> None:
-        if not self._sensing.models_drives or self._estimate is None:
-            return
-        wrench = self._wrench(self._estimate, now)
+    def _model_drives(self, now: Configuration, state: RobotState, wrench: Array | None) -> None:
+        assert self._estimate is not None
         contact = self._zero
         if wrench is not None and self._frame is not None:
             contact = wrench.dot(now.frames[self._frame].jacobian)
@@ -304,13 +333,23 @@ class PositionInterface:
         )
 
 
-def desired_wrench(wrench: SineWrench, time: PhaseTime) -> Array:
-    """f^d (6,) at a time of a phase; its mean is reached, and left at the end, along minimum-jerk curves."""
-    since_s = time.since_start_s
-    share = minimum_jerk(since_s, wrench.ramp_s)[0] * minimum_jerk(time.left_s, wrench.ramp_s)[0]
+def desired_wrench(wrench: SineWrench, since_s: float, left_s: float) -> Array:
+    """f^d (6,) at a time since its start and before the phase's end; both are ramps along minimum-jerk curves."""
+    share = minimum_jerk(since_s, wrench.ramp_s)[0] * minimum_jerk(left_s, wrench.ramp_s)[0]
     sine = math.sin(2.0 * math.pi * wrench.frequency_hz * max(0.0, since_s - wrench.ramp_s))
     desired: Array = share * (np.array(wrench.mean) + sine * np.array(wrench.amplitude))
     return desired
+
+
+def largest_offset(description: RobotDescription) -> Array:
+    """(τ_max + d + k_d q̇_max) / k_p (n,) [rad]: what drives at their limits of torque and speed can make use of."""
+    return np.array(
+        [
+            (joint.torque_limit + joint.drive.dead_zone + joint.drive.velocity_gain * joint.velocity_limit)
+            / joint.drive.position_gain
+            for joint in description.joints
+        ]
+    )
 
 
 def _sensor_frame(description: RobotDescription, name: str | None) -> str | None:

@@ -110,11 +110,6 @@ class Motors:
             offset += self.coulomb * np.tanh(velocity / self.coulomb_velocity)
         return offset
 
-    def largest_offset(self, torque: Array, speed: Array) -> Array:
-        """k_τ τ + k_v q̇ + k_c (n,) [rad] at a drive's limits of torque and speed: more is never of use."""
-        largest: Array = self.torque_gain * torque + self.velocity_gain * speed + self.coulomb
-        return largest
-
     def torque(self, offset: Array, velocity: Array) -> Array:
         """τ (n,) [N·m] that an offset Δq gives at a velocity, (6) solved for τ."""
         torque: Array = (offset - self.friction(velocity)) / self.torque_gain

@@ -5,15 +5,21 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from schemas.control_law import MotorModel
 from schemas.controller import ControllerConfig, Phase
 from schemas.errors import ConfigurationError
-from schemas.robot import RobotDescription
+from schemas.robot import Joint, RobotDescription
 from schemas.scenario import Scenario
 
 MAXIMUM_BACK_CALCULATION_PERIOD = 0.5
 """κT above this is near the border of stability where J⁺ is far from orthogonal."""
 MAXIMUM_LAMBDA_PERIOD = 0.3
 """λT above this leaves no phase margin for the integral loop with a cycle of delay."""
+
+TORQUE_GAIN_SHARES = (0.2, 5.0)
+"""Of k_τ k_p, which torque scale and cautious fits bring away from 1, but a wrong unit by more."""
+LONGEST_VELOCITY_GAIN_S = 0.1
+"""k_v, where friction of the gear has a part that the description does not tell."""
 
 
 def check_run(robot: RobotDescription, scenario: Scenario, path: Path | str) -> None:
@@ -59,6 +65,15 @@ def _check_joints(robot: RobotDescription, scenario: Scenario, path: Path | str)
             low, high = limits[joint]
             if not low <= angle <= high:
                 raise ConfigurationError(f"{path}: {field}.{joint}: {angle:g} rad lies outside [{low:g}, {high:g}] rad")
+    speeds = {joint.name: joint.velocity_limit for joint in robot.joints}
+    for index, phase in enumerate(scenario.controller.phases):
+        for name, sine in ({} if phase.joint_sines is None else phase.joint_sines.joints).items():
+            speed = 2.0 * math.pi * sine.frequency_hz * (sine.amplitude + sine.growth * phase.duration_s)
+            if speed > speeds[name]:
+                raise ConfigurationError(
+                    f"{path}: controller.phases.{index}.joint_sines.joints.{name}: reaches {speed:.3g} rad/s at the"
+                    f" phase's end, its velocity_limit is {speeds[name]:g}"
+                )
 
 
 def _check_rates(robot: RobotDescription, scenario: Scenario, path: Path | str) -> None:
@@ -105,6 +120,24 @@ def _postures(index: int, phase: Phase) -> list[tuple[str, dict[str, float]]]:
     return own + [(f"{field}.joint_path.points.{number}.posture", point.posture) for number, point in enumerate(points)]
 
 
+def _check_motor(joint: Joint, motor: MotorModel, path: Path | str) -> None:
+    """Refuse a motor model that is not of this drive: its law gives k_τ = 1/k_p and k_v = k_d/k_p but for friction."""
+    drive = joint.drive
+    field = f"{path}: controller.position_torque.motors.{joint.name}"
+    share, (low, high) = motor.torque_gain * drive.position_gain, TORQUE_GAIN_SHARES
+    if not low <= share <= high:
+        raise ConfigurationError(
+            f"{field}.torque_gain: {motor.torque_gain:g} rad/(N·m) is {share:.3g} times what the drive's position_gain"
+            f" says, 1/k_p = {1.0 / drive.position_gain:.3g}; expected {low:g} to {high:g} times. Unit: rad/(N·m)"
+        )
+    longest = max(LONGEST_VELOCITY_GAIN_S, high * drive.velocity_gain / drive.position_gain)
+    if motor.velocity_gain > longest:
+        raise ConfigurationError(
+            f"{field}.velocity_gain: {motor.velocity_gain:g} s; expected at most {longest:.3g} s, the drive's own"
+            f" k_d/k_p is {drive.velocity_gain / drive.position_gain:.3g} s. Unit: s"
+        )
+
+
 def _check_position_torque(robot: RobotDescription, controller: ControllerConfig, path: Path | str) -> None:
     """Refuse torque control through the position interface that lacks what it needs."""
     config = controller.position_torque
@@ -120,18 +153,28 @@ def _check_position_torque(robot: RobotDescription, controller: ControllerConfig
             raise ConfigurationError(
                 f"{field}.wrench: needs the robot's hand_frame and controller.position_torque.sensor"
             )
+        if config.desired != "qp" and (phase.hand_path is not None or controller.collision is not None):
+            what = "hand_path" if phase.hand_path is not None else "torque_control: controller.collision"
+            raise ConfigurationError(
+                f"{field}.{what}: acts through the QP only; set controller.position_torque.desired to qp"
+            )
     if config is None:
         return
+    if config.sensor is not None and robot.hand_frame is None:
+        raise ConfigurationError(
+            f"{path}: controller.position_torque.sensor: robot {robot.name} has no hand_frame, at which its wrench acts"
+        )
     if config.payload is not None and config.sensor is None:
         raise ConfigurationError(
             f"{path}: controller.position_torque.payload: is what a force/torque sensor carries; name the sensor"
         )
-    for joint in robot.joint_names:
-        if joint not in config.motors:
+    for joint in robot.joints:
+        if joint.name not in config.motors:
             raise ConfigurationError(
-                f"{path}: controller.position_torque.motors: no model of {joint}; identify it (`cosim identify motors`)"
-                " and name the result in motors_from"
+                f"{path}: controller.position_torque.motors: no model of {joint.name}; identify it"
+                " (`cosim identify motors`) and name the result in motors_from"
             )
+        _check_motor(joint, config.motors[joint.name], path)
     names = {"sensor": [s.name for s in robot.force_torque_sensors], "imu": [imu.name for imu in robot.imus]}
     for field, known in names.items():
         name = getattr(config, field)

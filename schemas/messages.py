@@ -133,7 +133,7 @@ class MotionTrace(Model):
     link_torque: Vector
     """[N·m] what a sensor behind the gear would measure: without the rotors' inertia."""
     base_wrench: Vector
-    """[N, N·m] what the mount of a fixed base exerts, or the unknown wrench on a floating one; base axes and origin."""
+    """[N, N·m] what the mount of the base exerts, in its axes at its origin."""
 
 
 class OffsetTrace(Model):

@@ -8,7 +8,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from schemas.base import Clock, Model
 from schemas.controller import ControllerConfig
-from schemas.world import World
+from schemas.world import Box, World
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 
@@ -86,6 +86,15 @@ class PlantConfig(Model):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        for index, obstacle in enumerate(self.world.obstacles):
+            if isinstance(obstacle, Box) and obstacle.stiffness is not None:
+                turn = self.substep_s * (obstacle.stiffness / obstacle.mass) ** 0.5
+                if turn > 1.0:
+                    raise ValueError(
+                        f"world.obstacles.{index}.stiffness: {obstacle.name} with {obstacle.mass:g} kg turns by"
+                        f" {turn:.2g} rad of its own swing in substep_s {self.substep_s:g} s; expected at most 1: lower"
+                        " the stiffness, raise the mass"
+                    )
         for index, event in enumerate(self.world.events):
             if event.duration_s < self.substep_s:
                 raise ValueError(

@@ -258,6 +258,24 @@ def test_between_torque_drives_own_mode_and_positions_it_goes_without_a_jump(pla
     assert torque[498:506].max() < 0.01
 
 
+def test_a_fade_that_has_not_ended_is_neither_dropped_nor_found_again(play: Callable[..., Played]) -> None:
+    """From offsets to positions for less than `start_s`, to torque mode and back to positions."""
+    phases = [
+        MIXED[0],
+        {"name": "offsets", "mode": "position", "duration_s": 0.4, "torque_control": True},
+        {"name": "short", "mode": "position", "duration_s": 0.1},
+        {"name": "torque", "mode": "torque", "duration_s": 0.2},
+        {"name": "back", "mode": "position", "duration_s": 0.2},
+    ]
+    played = play(phases).go(530)
+    assert played.stages[349:352] == [Stage.POSITION, Stage.CAPTURE, Stage.TORQUE]
+    before, captured = (np.array(played.loop.commands[k].position) for k in (349, 350))
+    assert captured == pytest.approx(before, abs=2e-3)  # the reference stops where it was a cycle ago
+    assert played.stages[449:451] == [Stage.TORQUE, Stage.POSITION]
+    back = played.loop.commands[450]
+    assert back.position == pytest.approx(played.loop.traces[450].position_estimated, abs=1e-9)
+
+
 def test_the_same_states_give_the_same_commands(play: Callable[..., Played]) -> None:
     first, second = (play(MOVING).go(300).commands for _ in range(2))
     assert np.array_equal(first, second)

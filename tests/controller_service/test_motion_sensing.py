@@ -217,6 +217,7 @@ def test_a_sensor_that_is_silent_for_long_is_told_and_its_window_filled_anew(
         assert one.ready
     feed(one, **silent(LONGEST_HOLD + 1))
     assert one.silent == (name, LONGEST_HOLD + 1)
+    assert not one.ready
     feed(one, **reading)
     assert one.silent is None
     assert one.ready is (estimator == "kalman")

@@ -13,7 +13,14 @@ from controller_service.acceleration_qp import AccelerationQp
 from controller_service.constraints import JointLimits
 from controller_service.errors import ControllerError
 from controller_service.model import Array, Configuration, RobotModel
-from controller_service.position_interface import SPEED_SHARE, Fade, InterfaceTick, PositionInterface, desired_wrench
+from controller_service.position_interface import (
+    SPEED_SHARE,
+    Fade,
+    InterfaceTick,
+    PositionInterface,
+    desired_wrench,
+    largest_offset,
+)
 from controller_service.schedule import PhaseTime, Targets
 from controller_service.task_set import TaskSet
 from controller_service.tasks import PostureTarget
@@ -66,7 +73,7 @@ def test_the_desired_wrench_comes_swings_and_goes() -> None:
     mean, amplitude = np.array(sine.mean), np.array(sine.amplitude)
 
     def at(time: float) -> Array:
-        return desired_wrench(sine, phase_time(time))
+        return desired_wrench(sine, time, 5.0 - time)
 
     assert not at(0.0).any()
     assert at(0.5) == pytest.approx(0.5 * mean)
@@ -138,9 +145,11 @@ class Arm:
             self.interface.watch(None, now, self.state, 1)
         return self.sense(**fields)
 
-    def start(self, target: Array = POSTURE, given: Array = POSTURE, **fields: Any) -> InterfaceTick:
+    def start(
+        self, target: Array = POSTURE, given: Array = POSTURE, time: PhaseTime | None = None, **fields: Any
+    ) -> InterfaceTick:
         now = self.settle(**fields)
-        return self.interface.start(given, now, phase_time(0.0), targets(target), self.state, 1)
+        return self.interface.start(given, now, time or phase_time(0.0), targets(target), self.state, 1)
 
     def step(
         self,
@@ -317,8 +326,8 @@ def test_a_wanted_wrench_is_given_in_advance_and_its_error_fed_back(arm_of: Call
     one = arm_of(sensor=True, position_gain=0.0)
     one.start()
     base = one.step()
-    time = phase_time(2.0, wrench={"mean": [0, 0, 20, 0, 0, 0], "ramp_s": 1.0})
-    for _ in range(3 * WINDOW):
+    time = phase_time(2.0, wrench={"mean": [0, 0, 20, 0, 0, 0], "ramp_s": 0.2})
+    for _ in range(round(1.0 / T)):  # also one entered late rises from nothing
         tick = one.step(time=time)
     jacobian = one.model.configure(POSTURE, ZERO).frames["hand"].jacobian
     wanted = np.array([0.0, 0.0, 20.0, 0.0, 0.0, 0.0])
@@ -328,6 +337,25 @@ def test_a_wanted_wrench_is_given_in_advance_and_its_error_fed_back(arm_of: Call
     k_p, k_f = one.config.torque_gain, one.config.force_gain
     expected = -one.gain * (k_p * (1.0 + k_f) + k_f) * ((wanted - tick.wrench) @ jacobian)
     assert tick.terms.force == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_wrench_entered_late_comes_along_its_ramp(arm_of: Callable[..., Arm]) -> None:
+    """As after a hold in the middle of its phase: nothing at the start, no step later."""
+    one = arm_of(sensor=True)
+    time = phase_time(2.0, wrench={"mean": [0, 0, 50, 0, 0, 0], "amplitude": [0, 0, 20, 0, 0, 0], "ramp_s": 0.4})
+    wanted = [one.start(time=time).wrench_reference[2]]
+    wanted += [one.step(time=time).wrench_reference[2] for _ in range(400)]
+    assert wanted[0] == 0.0
+    assert wanted[200] == pytest.approx(50.0, abs=0.5)
+    assert np.abs(np.diff(wanted)).max() < 1.1 * T * (1.9 * 50.0 / 0.4 + 2.0 * np.pi * 0.5 * 20.0)
+
+
+def test_the_largest_offset_is_what_a_drive_at_its_limits_can_use(arm: Robot) -> None:
+    """The firmware's law τ = D(k_p Δq − k_d q̇) is at its limit there."""
+    for joint, largest in zip(arm.description.joints, largest_offset(arm.description).tolist(), strict=True):
+        drive = joint.drive
+        effort = drive.position_gain * largest - drive.velocity_gain * joint.velocity_limit
+        assert effort - drive.dead_zone == pytest.approx(joint.torque_limit)
 
 
 def test_started_again_nothing_of_the_last_time_is_left(arm_of: Callable[..., Arm]) -> None:

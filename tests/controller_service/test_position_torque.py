@@ -247,16 +247,6 @@ def test_the_motor_s_torque_is_6_solved(coulomb: bool) -> None:
         assert held.all()
 
 
-def test_no_offset_within_the_drive_s_limits_is_above_the_largest() -> None:
-    own, draw = motors(), np.random.default_rng(10).uniform
-    speed = np.full(N, 6.0)
-    largest = own.largest_offset(LIMIT, speed)
-    for _ in range(50):
-        offset = own.torque_gain * draw(-1, 1, N) * LIMIT + own.friction(draw(-1, 1, N) * speed)
-        assert (np.abs(offset) <= largest).all()
-    assert own.torque_gain * LIMIT + own.friction(speed) == pytest.approx(largest, rel=1e-6)
-
-
 def test_motors_stand_in_the_order_of_the_joints() -> None:
     models = {
         "knee": {"torque_gain": 1e-4, "velocity_gain": 0.01, "coulomb": 2e-4},

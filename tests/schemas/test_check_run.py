@@ -166,3 +166,43 @@ def test_the_run_holds_the_motors_themselves(files: Any) -> None:
     again = Scenario.model_validate_json(run.scenario.model_dump_json(by_alias=True))
     assert again == run.scenario
     check_run(run.robot.description, again, "log")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"torque_gain": 1.0}, "elbow.torque_gain: 1 rad/(N·m) is "),
+        ({"torque_gain": 2e-6}, "expected 0.2 to 5 times. Unit: rad/(N·m)"),
+        ({"velocity_gain": 20.0}, "elbow.velocity_gain: 20 s; expected at most "),
+    ],
+)
+def test_a_motor_in_wrong_units_is_refused(files: Any, change: dict[str, float], expected: str) -> None:
+    """A column of a table in 10⁻³ must not make the law a thousand times as stiff."""
+    _torque_control(files, motors={**MOTORS, "elbow": MOTORS["elbow"] | change})
+    assert expected in _refusal(files)
+
+
+@pytest.mark.parametrize("part", ["hand_path", "collision"])
+def test_what_acts_through_the_qp_alone_is_refused_without_it(files: Any, part: str) -> None:
+    phase = _torque_control(files)
+    if part == "hand_path":
+        phase["hand_path"] = {"diameter_m": 0.1, "lap_s": 1.0}
+    else:
+        files.scenario["controller"]["collision"] = {}
+    text = _refusal(files)
+    assert part in text
+    assert "set controller.position_torque.desired to qp" in text
+    files.scenario["controller"]["position_torque"]["desired"] = "qp"
+    files.load()
+
+
+def test_a_sensor_without_a_hand_is_refused(files: Any) -> None:
+    _torque_control(files)
+    files.robot["hand_frame"] = None
+    assert "position_torque.sensor: robot" in _refusal(files)
+
+
+def test_a_sine_faster_than_its_joint_is_refused(files: Any) -> None:
+    phase = files.scenario["controller"]["phases"][0]
+    phase["joint_sines"] = {"joints": {"elbow": {"growth": 10.0, "frequency_hz": 5.0}}, "fade_s": 0.1}
+    assert "joint_sines.joints.elbow: reaches " in _refusal(files)

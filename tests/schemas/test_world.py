@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from schemas.errors import ConfigurationError
 from schemas.messages import PlantTruth
@@ -101,3 +102,10 @@ def test_truth_of_logs_that_know_no_world_is_read() -> None:
     )
     old = {key: value for key, value in json.loads(encode(truth)).items() if key not in {"contacts", "world_forces"}}
     assert decode(PlantTruth, json.dumps(old).encode()) == truth
+
+
+def test_springs_too_stiff_for_the_substep_are_refused() -> None:
+    box = {"kind": "box", "name": "block", "position_in_world": [0, 0, 0], "half_sizes": [1, 1, 1], "mass": 1.0}
+    PlantConfig.model_validate({"substep_s": 0.0005, "world": {"obstacles": [box | {"stiffness": 3.9e6}]}})
+    with pytest.raises(ValidationError, match=r"obstacles\.0\.stiffness: block with 1 kg turns by 1\.\d+ rad"):
+        PlantConfig.model_validate({"substep_s": 0.0005, "world": {"obstacles": [box | {"stiffness": 5e6}]}})
