@@ -17,7 +17,15 @@ from schemas.errors import ConfigurationError, CosimError
 
 Metric = float | int | str | bool | None | list[float] | dict[str, float] | dict[str, str]
 
-RESULT_NAMES: Final = ("metrics.json", "sweep.png", "*/to_torque.png", "*/to_position.png", "table-1.md")
+RESULT_NAMES: Final = (
+    "metrics.json",
+    "sweep.png",
+    "*/to_torque.png",
+    "*/to_position.png",
+    "table-1.md",
+    "tables-2-3.md",
+    "estimators.md",
+)
 """Results at a run's place beside the figures that are called like their experiment."""
 
 
