@@ -114,6 +114,8 @@ class Identification:
     data: MotorData
     logs: tuple[str, ...] = field(default=())
     """Names of the logs."""
+    cut: tuple[str, ...] = field(default=())
+    """Names of those that are cut short."""
 
     def motors(self) -> dict[str, dict[str, float]]:
         """Give the models as `controller.position_torque.motors` takes them."""
@@ -126,7 +128,8 @@ class Identification:
             "robot": self.robot.name,
             "logs": list(self.logs),
             "method": options.method.value,
-            "weight": options.weight,
+            "weight": weight_of(options),
+            "cut_logs": list(self.cut),
             "still_velocity": options.still_velocity,
             "window": options.filter.window,
             "rows": self.data.rows,
@@ -134,6 +137,11 @@ class Identification:
             "left_out": self.data.left_out,
             "joints": {each.joint: each.as_json() for each in self.joints},
         }
+
+
+def weight_of(options: IdentifyOptions) -> float:
+    """W of (8); least squares has none, which is 1."""
+    return 1.0 if options.method is FitMethod.LEAST_SQUARES else options.weight
 
 
 def identify(
@@ -172,7 +180,8 @@ def identify(
     for index, joint in enumerate(robot.joints):
         progress(0.9 + 0.1 * index / len(robot.joints), joint.name)
         joints.append(_identify_joint(joint, data, index, options))
-    return Identification(robot, options, tuple(joints), data, tuple(names))
+    cut = [name for name, series in zip(names, logs, strict=False) if not series.complete]
+    return Identification(robot, options, tuple(joints), data, tuple(names), tuple(cut))
 
 
 def fit_joint(joint: Joint, samples: MotorSamples, options: IdentifyOptions) -> MotorFit:
@@ -258,8 +267,9 @@ def _check_signs(joint: str, fit: MotorFit) -> None:
     for name, (value, unit) in gains.items():
         if value < 0.0 or (name == "k_τ" and value == 0.0):
             raise IdentifyError(
-                f"{joint}: {name} comes out as {value:.3g} {unit}, it must be above zero. Check the signs of encoder,"
-                " force/torque sensor and target, and that the log holds the robot's large torques and velocities."
+                f"{joint}: {name} comes out as {value:.3g} {unit}, which no drive has. Check the signs of encoder,"
+                " force/torque sensor and target, and that the log holds the robot's large torques and speeds; for k_c"
+                " try --method least-squares or asymmetric, which fit it with k_τ."
             )
 
 

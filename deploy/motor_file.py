@@ -11,7 +11,7 @@ import yaml
 
 from controller_service.ft_calibration import Payload
 from deploy.errors import ReportError, UsageError
-from deploy.identify import Identification
+from deploy.identify import Identification, weight_of
 from schemas.control_law import SensorPayload
 
 DIGITS = 5
@@ -29,7 +29,7 @@ def write_motors(result: Identification, path: Path) -> None:
     logs = ", ".join(result.logs) or "a log"
     lines = [
         f"Motors of {result.robot.name}, identified by `cosim identify motors` from {logs}:",
-        f"method {options.method.value}, weight {options.weight:g}, window {options.filter.window}, at rest below"
+        f"method {options.method.value}, weight {weight_of(options):g}, window {options.filter.window}, at rest below"
         f" {options.still_velocity:g} rad/s.",
         "Units: torque_gain rad/(N·m), velocity_gain s, coulomb rad, (6) of [Del Prete 2016].",
     ]

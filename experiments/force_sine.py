@@ -58,6 +58,8 @@ OWN_WHOLE: Final = tuple(VARIANTS["without"])
 OVERSHOOT: Final = 0.10
 COUPLING: Final = 0.10
 COUPLING_AIM: Final = 0.05
+AMPLITUDE_RATIO: Final = 0.8
+"""Of the force's fundamental: a force that hardly follows has no overshoot either."""
 ERROR_RATIO: Final = 1.5
 """Of the force's swing after and before the event, and of the errors of the first period and all."""
 LEAST_SWING_N: Final = 1.0
@@ -110,6 +112,7 @@ def evaluate(
     bars = (
         Bar("with_overshoot", metrics["with_overshoot"], OVERSHOOT),
         Bar("with_coupling", metrics["with_coupling"], COUPLING),
+        Bar("with_amplitude_ratio", metrics["with_amplitude_ratio"], AMPLITUDE_RATIO, at_least=True),
         Bar("with_error_ratio_first_touch", metrics["with_error_ratio_first_touch"], ERROR_RATIO),
         *(
             Bar(f"{name}_{key}", metrics[f"{name}_{key}"], limit)

@@ -108,10 +108,25 @@ def table(result: Identification, truth: TrueMotors) -> str:
             (each.fit.torque_gain, truth.torque_gain, 4),
             (each.fit.velocity_gain, truth.velocity_gain, 2),
         ):
-            low, middle, high = sorted(1e3 * true[:, index])
+            low, middle, high = 1e3 * true[::-1, index]  # σ = 1, 0, −1
             columns.append(f"{1e3 * gain:.{digits}f}")
             columns.append(f"{middle:.{digits}f} ({low:.{digits}f} … {high:.{digits}f})")
         lines.append(f"| {' | '.join(columns)} |")
+    lines += [
+        "",
+        "Over-estimated samples, the worst joint: rate, and largest size over the largest abs(Δq)",
+        "",
+        "| w | two-stage | one stage |",
+        "|---|---|---|",
+    ]
+    for weight in WEIGHTS:
+        worst = []
+        for method in (FitMethod.TWO_STAGE, FitMethod.ASYMMETRIC):
+            of = [fit.statistics for fit in _fits(result, method, weight)]
+            rate = max(each.over_estimation_rate for each in of)
+            size = max(each.largest_over_estimation_relative for each in of)
+            worst.append(f"{100.0 * rate:.1f} %, {100.0 * size:.1f} %")
+        lines.append(f"| {weight:g} | {' | '.join(worst)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -136,10 +136,13 @@ def _print_motors(result: Identification) -> None:
     from rich.text import Text
 
     from deploy.commands.experiment import show
+    from deploy.identify import weight_of
 
     options = result.options
+    for name in result.cut:
+        typer.echo(f"cosim: {name}: the log is cut short; what there is was used", err=True)
     table = Table(
-        title=f"Motors of {result.robot.name}: {options.method.value}, w = {options.weight:g};"
+        title=f"Motors of {result.robot.name}: {options.method.value}, w = {weight_of(options):g};"
         " over-estimation of |Δq|: rate, largest over the largest |Δq|",
         title_justify="left",
     )
