@@ -278,9 +278,10 @@ class Controller:
 
     def _capture(self, state: RobotState, time: PhaseTime, estimate: Estimate, elapsed_s: float, before: Stage) -> Tick:
         """First step of the transition: the target stands still, QP and tasks get the measured configuration."""
-        self._position = _firmware_target(state)
         if before is Stage.POSITION:
             self._position = self._fade.advance(self._ahead(elapsed_s)[0], elapsed_s)
+        else:
+            self._position = _firmware_target(state)
         self._velocity = np.zeros(self._n)
         self._fade.stop()
         now = self._model.configure(estimate.position, estimate.velocity)
