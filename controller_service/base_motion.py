@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from controller_service.model import Array
+from controller_service.model import Array, frozen, make_revolute, read_urdf
 from schemas.errors import ConfigurationError
 from schemas.load import Robot
 
@@ -39,8 +39,7 @@ class BaseMotion:
         """
         zero = np.zeros(3)
         zero.setflags(write=False)
-        acceleration = -np.asarray(gravity_in_base, dtype=np.float64)
-        acceleration.setflags(write=False)
+        acceleration = frozen(-np.asarray(gravity_in_base, dtype=np.float64))
         return cls(zero, zero, acceleration)
 
 
@@ -179,17 +178,10 @@ def floating_model(robot: Robot, cuts: Sequence[str] = ()) -> tuple[pin.Model, d
     for joint in urdf.findall("joint"):
         name = joint.get("name")
         if name in kept and (name not in driven or joint.get("type") == "continuous"):
-            # Pinocchio gives a continuous joint two coordinates; the axis of one that never moves is any
-            joint.set("type", "revolute")
-            for child in joint.findall("limit") + ([] if name in driven else joint.findall("axis")):
-                joint.remove(child)
-            ElementTree.SubElement(joint, "limit", lower="-1e3", upper="1e3", effort="1e9", velocity="1e9")
-    try:
-        model = pin.buildModelFromXML(ElementTree.tostring(urdf, encoding="unicode"), pin.JointModelFreeFlyer())
-    except (ValueError, RuntimeError) as error:
-        raise ConfigurationError(
-            f"robot {robot.description.name}: Pinocchio cannot read the URDF: {' '.join(str(error).split())}"
-        ) from error
+            make_revolute(joint)
+            for axis in [] if name in driven else joint.findall("axis"):
+                joint.remove(axis)  # that of a joint that never moves is any
+    model = read_urdf(robot, urdf, pin.JointModelFreeFlyer())
     for name in driven:
         if name not in model.names:
             raise ConfigurationError(f"robot {robot.description.name}: the URDF has no movable joint {name!r}")

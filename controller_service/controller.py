@@ -29,7 +29,6 @@ from schemas.controller import Phase
 from schemas.errors import ConfigurationError
 from schemas.load import Run
 from schemas.messages import ControllerTrace, Event, HalStatus, JointCommand, RobotState
-from schemas.robot import RobotDescription
 
 CLIP_SHARE = 1e-3
 """Share of the torque limit beyond which a clipped torque is reported."""
@@ -82,10 +81,7 @@ class Controller:
         self._period = description.period_s
         self._config = config
         self._frame = description.hand_frame
-        frames = [] if self._frame is None else [self._frame]
-        if config.position_torque is not None:
-            frames += sensor_frames(description, config.position_torque.sensor)
-        self._model = RobotModel(run.robot, tuple(dict.fromkeys(frames)))
+        self._model = RobotModel(run.robot, (self._frame,) if self._frame else ())
         self._n = self._model.n
         self._estimator = VelocityEstimator(self._period, config.velocity_cutoff_hz)
         self._schedule = Schedule(description, config.phases)
@@ -364,11 +360,6 @@ class Controller:
         if self._stage is Stage.POSITION:
             pose = self._model.pose(estimate.position, self._frame)
         return HandTrace(self._references.hand_target, pose)
-
-
-def sensor_frames(description: RobotDescription, sensor: str | None) -> list[str]:
-    """Frame of a force/torque sensor, if there is one."""
-    return [each.frame for each in description.force_torque_sensors if each.name == sensor]
 
 
 def _firmware_target(state: RobotState) -> Array:

@@ -119,11 +119,11 @@ class RobotModel:
             for name, index in self._frames.items():
                 frames[name] = self._kinematics(index, velocity)
         return Configuration(
-            _frozen(position.copy()),
-            _frozen(velocity.copy()),
-            _frozen(mass),
-            _frozen(coriolis),
-            _frozen(nonlinear),
+            frozen(position.copy()),
+            frozen(velocity.copy()),
+            frozen(mass),
+            frozen(coriolis),
+            frozen(nonlinear),
             frames,
         )
 
@@ -149,12 +149,12 @@ class RobotModel:
         if self._order is not None:
             rate = rate[:, self._order]
         return FrameKinematics(
-            _frozen(placement.translation.copy()),
-            _frozen(placement.rotation.copy()),
-            _frozen(jacobian),
-            _frozen(jacobian.dot(velocity)),
-            _frozen(drift.copy()),
-            _frozen(rate),
+            frozen(placement.translation.copy()),
+            frozen(placement.rotation.copy()),
+            frozen(jacobian),
+            frozen(jacobian.dot(velocity)),
+            frozen(drift.copy()),
+            frozen(rate),
         )
 
     def _frame_id(self, name: str) -> int:
@@ -164,10 +164,36 @@ class RobotModel:
         return index
 
 
-def _frozen(array: Array) -> Array:
+def frozen(array: Array) -> Array:
     """Make an array that nobody else holds read-only: Pinocchio's matrices are new ones, its vectors need a copy."""
     array.setflags(write=False)
     return array
+
+
+def make_revolute(joint: ElementTree.Element) -> None:
+    """Make a URDF's joint a revolute one with limits beyond all use.
+
+    Pinocchio gives a continuous joint two coordinates; the description limits every joint, so one is enough.
+    """
+    joint.set("type", "revolute")
+    for limit in joint.findall("limit"):
+        joint.remove(limit)
+    ElementTree.SubElement(joint, "limit", lower="-1e3", upper="1e3", effort="1e9", velocity="1e9")
+
+
+def read_urdf(robot: Robot, root: ElementTree.Element, *base: pin.JointModelFreeFlyer) -> pin.Model:
+    """Have Pinocchio read a URDF, on a fixed base or on the joint given.
+
+    Raises:
+        ConfigurationError: it cannot.
+
+    """
+    try:
+        return pin.buildModelFromXML(ElementTree.tostring(root, encoding="unicode"), *base)
+    except (ValueError, RuntimeError) as error:
+        raise ConfigurationError(
+            f"robot {robot.description.name}: Pinocchio cannot read the URDF: {' '.join(str(error).split())}"
+        ) from error
 
 
 def _build(robot: Robot) -> pin.Model:
@@ -175,17 +201,8 @@ def _build(robot: Robot) -> pin.Model:
     root = ElementTree.fromstring(robot.urdf)
     for joint in root.iter("joint"):
         if joint.get("type") == "continuous":
-            # Pinocchio gives a continuous joint two coordinates; the description limits every joint, so one is enough
-            joint.set("type", "revolute")
-            for limit in joint.findall("limit"):
-                joint.remove(limit)
-            ElementTree.SubElement(joint, "limit", lower="-1e3", upper="1e3", effort="1e9", velocity="1e9")
-    try:
-        model = pin.buildModelFromXML(ElementTree.tostring(root, encoding="unicode"))
-    except (ValueError, RuntimeError) as error:
-        raise ConfigurationError(
-            f"robot {robot.description.name}: Pinocchio cannot read the URDF: {' '.join(str(error).split())}"
-        ) from error
+            make_revolute(joint)
+    model = read_urdf(robot, root)
     for name in names - set(model.names):
         raise ConfigurationError(f"robot {robot.description.name}: the URDF has no movable joint {name!r}")
     locked = [model.getJointId(name) for name in model.names if name not in names and name != "universe"]

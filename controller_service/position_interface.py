@@ -159,17 +159,13 @@ class PositionInterface:
         """Refuse a hand that the sensor does not carry: the wrench that it reads does not act there."""
         if self._sensor_frame is None or self._frame is None:
             return
-        joints = [model.model.frames[model.model.getFrameId(name)].parentJoint for name in self.frames]
-        if joints[0] not in list(model.model.subtrees[joints[1]]):
+        whole = model.model
+        hand, sensor = (whole.frames[whole.getFrameId(name)].parentJoint for name in (self._frame, self._sensor_frame))
+        if hand not in list(whole.subtrees[sensor]):
             raise ConfigurationError(
                 f"controller.position_torque.sensor: the robot's hand_frame {self._frame!r} does not lie beyond the"
                 f" sensor {self._config.sensor!r} (link {self._sensor_frame!r}): what it reads is not the hand's wrench"
             )
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Hand and sensor."""
-        return tuple(frame for frame in (self._frame, self._sensor_frame) if frame is not None)
 
     @property
     def delay_s(self) -> float:
@@ -217,7 +213,7 @@ class PositionInterface:
         self._last_command = position
         tick = self._compute(now, time, targets, state, cycles)
         self._fade.start(position - tick.command)
-        return replace(tick, command=position)
+        return replace(tick, command=position, limited=())
 
     def step(
         self, now: Configuration, time: PhaseTime, targets: Targets, state: RobotState, cycles: int, speed: Array
@@ -251,8 +247,8 @@ class PositionInterface:
         step = cycles * self._step
         command = np.minimum(np.maximum(in_range, self._last_command - step), self._last_command + step)
         self._last_command = command
-        limited = self._limited(tick, in_range != wanted, command != in_range)
-        return replace(tick, command=command, limited=limited)
+        limited = self._named("position range", in_range != wanted) + self._named("velocity limit", command != in_range)
+        return replace(tick, command=command, limited=tick.limited + limited)
 
     def _compute(
         self, now: Configuration, time: PhaseTime, targets: Targets, state: RobotState, cycles: int
@@ -286,12 +282,14 @@ class PositionInterface:
             force_gain = 0.0 if time.phase.wrench is None else self._config.force_gain
             terms = self._law.terms(desired, velocity, errors, now.mass, jacobian, force_gain, elapsed_s)
         of_torque = terms.of_torque
-        offset = np.minimum(np.maximum(of_torque + terms.friction, -self._largest), self._largest)
+        asked = of_torque + terms.friction
+        offset = np.minimum(np.maximum(asked, -self._largest), self._largest)
         command = now.position + self._lead_s * velocity + offset
         if self._sensing.models_drives:
             self._model_drives(now, state, wrench)
+        limited = self._named("offset limit", offset != asked)
         return InterfaceTick(
-            estimate, terms, desired, wrench, wanted, motion, of_torque / self._motors.torque_gain, command, ()
+            estimate, terms, desired, wrench, wanted, motion, of_torque / self._motors.torque_gain, command, limited
         )
 
     def _reference_motion(self, now: Configuration, targets: Targets, state: RobotState) -> ReferenceMotion:
@@ -321,16 +319,11 @@ class PositionInterface:
             contact = wrench.dot(now.frames[self._frame].jacobian)
         self._sensing.remember(now, self._estimate, state, contact)
 
-    def _limited(self, tick: InterfaceTick, ranged: Mask, slowed: Mask) -> tuple[str, ...]:
-        """Name the limits that act."""
-        full = np.abs(tick.terms.of_torque + tick.terms.friction) > self._largest
-        acting = (("offset limit", full), ("position range", ranged), ("velocity limit", slowed))
-        return tuple(
-            f"{self._names[joint]}: {name}"
-            for name, mask in acting
-            if np.count_nonzero(mask)
-            for joint in np.flatnonzero(mask).tolist()
-        )
+    def _named(self, limit: str, acts: Mask) -> tuple[str, ...]:
+        """Name the joints on which a limit acts."""
+        if not np.count_nonzero(acts):
+            return ()
+        return tuple(f"{self._names[joint]}: {limit}" for joint in np.flatnonzero(acts).tolist())
 
 
 def desired_wrench(wrench: SineWrench, since_s: float, left_s: float) -> Array:

@@ -14,7 +14,7 @@ import pinocchio as pin
 from controller_service.base_motion import BaseMotion, floating_model
 from controller_service.errors import StateError
 from controller_service.ft_calibration import Payload
-from controller_service.model import Array
+from controller_service.model import Array, frozen
 from schemas.errors import ConfigurationError
 from schemas.load import Robot
 
@@ -117,7 +117,7 @@ class TorqueEstimator:
         self._external = pin.StdVec_Force()
         self._external.extend([pin.Force.Zero() for _ in range(model.njoints)])
         self._touched = tuple(self._external[end] for _, end in self._pairs)
-        self._zero = _frozen(np.zeros(6))
+        self._zero = frozen(np.zeros(6))
         self._floating = base == "floating"
         self._rows = 6 if unknown == "wrench" else 3
         self._unknown = self._unknown_frame(unknown_link, root)
@@ -187,11 +187,11 @@ class TorqueEstimator:
             unknown = np.zeros(6)
             unknown[: self._rows] = solution
         return TorqueEstimate(
-            _frozen(torque),
-            _frozen(torque - self._armature * acceleration),
+            frozen(torque),
+            frozen(torque - self._armature * acceleration),
             external,
-            _frozen(remainder),
-            _frozen(unknown),
+            frozen(remainder),
+            frozen(unknown),
             math.sqrt(remainder.dot(remainder)) if self._floating else 0.0,
         )
 
@@ -211,7 +211,7 @@ class TorqueEstimator:
                     pin.forwardKinematics(self.model, data, self._q)
                     placed = True
                 touched.vector = data.oMi[end].actInv(data.oMi[joint].act(pin.Force(result))).vector
-            results.append(_frozen(result))
+            results.append(frozen(result))
         return tuple(results)
 
     def _compensate(self, name: str, payload: Payload) -> None:
@@ -245,11 +245,6 @@ class TorqueEstimator:
                     " acts there; choose a link between the sensors, e.g. the trunk"
                 )
         return index
-
-
-def _frozen(array: Array) -> Array:
-    array.setflags(write=False)
-    return array
 
 
 def _sensor_frame(robot: Robot, name: str) -> str:

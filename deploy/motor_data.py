@@ -10,7 +10,7 @@ about each row, and torques follow from them by Newton-Euler (algorithm 1).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -24,14 +24,10 @@ from controller_service.model import RobotModel
 from controller_service.motor_samples import MotorSamples
 from controller_service.savitzky_golay import smooth
 from controller_service.torque_estimation import TorqueEstimator
-from deploy.errors import ReportError
-from deploy.series import Array, RunSeries, state_series, trace_series, truth_series
+from deploy.series import Array, RunSeries, read_series, stretches
 from hal.profile.firmware import FirmwareGains
 from schemas.control_law import SavitzkyGolayFilter
-from schemas.load import Robot, Run
-from schemas.log import LogReader
-from schemas.messages import ControllerTrace, Event, RobotState
-from schemas.topics import decode
+from schemas.load import Robot
 
 Mask = NDArray[np.bool_]
 
@@ -106,7 +102,7 @@ def motor_data(
         kept &= ~other
     half = config.window // 2
     parts = []
-    for first, last in _stretches(kept):
+    for first, last in stretches(kept):
         if last - first > 2 * (half + 1):
             parts.append(_Part(series, target, first, last, config))
     reasons["within half a window of these or of the ends"] = int(np.sum(kept)) - sum(len(part) for part in parts)
@@ -125,7 +121,7 @@ def motor_data(
 
 
 def read_states(path: Path, *, phases: bool = False) -> RunSeries:
-    """Read of a log what `motor_data` needs, which takes a third of the time of `read_series`.
+    """Read of a log what `motor_data` needs, which takes a third of the time of all.
 
     Args:
         path: of the log.
@@ -136,44 +132,7 @@ def read_states(path: Path, *, phases: bool = False) -> RunSeries:
         ReportError: it holds no state.
 
     """
-    reader = LogReader(path)
-    states: list[RobotState] = []
-    traces: list[ControllerTrace] = []
-    events: list[Event] = []
-    for record in reader.records(("state", "event", *(("trace",) if phases else ()))):
-        match record.topic:
-            case "state":
-                states.append(decode(RobotState, record.data))
-            case "trace":
-                traces.append(decode(ControllerTrace, record.data))
-            case _:
-                events.append(decode(Event, record.data))
-    if not states:
-        raise ReportError(f"{path}: the log holds no state; did the HAL start?")
-    return of_states(reader.run, states, traces, events, complete=reader.complete)
-
-
-def of_states(
-    run: Run,
-    states: list[RobotState],
-    traces: Sequence[ControllerTrace] = (),
-    events: Sequence[Event] = (),
-    *,
-    complete: bool = True,
-) -> RunSeries:
-    """Make a series of states alone, or with traces and events."""
-    description = run.robot.description
-    n = len(description.joints)
-    return RunSeries(
-        run=run,
-        complete=complete,
-        state=state_series(states, n),
-        command_sequence=np.array([], np.int64),
-        trace=trace_series(list(traces), n),
-        truth=truth_series([], n, description.hand_frame),
-        events=tuple(events),
-        statistics=(),
-    )
+    return read_series(path, ("state", "event", *(("trace",) if phases else ())))
 
 
 def together(data: list[MotorData]) -> MotorData:
@@ -242,9 +201,3 @@ def _torques(robot: Robot, parts: list[_Part], payload: Payload | None, progress
             if row % STEP == 0:
                 progress(row / len(torque))
     return torque
-
-
-def _stretches(mask: Mask) -> list[tuple[int, int]]:
-    """First and last + 1 of each run of rows in which a mask (K,) holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
-    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]

@@ -147,8 +147,12 @@ class RunSeries:
     """Of all buses, in the order of writing."""
 
 
-def read_series(path: Path) -> RunSeries:
+def read_series(path: Path, topics: Sequence[str] | None = None) -> RunSeries:
     """Read a log, whole or cut short.
+
+    Args:
+        path: of the log.
+        topics: to read, `state` among them; what comes of the others is empty. None: all.
 
     Raises:
         LogError: the file is not a readable log.
@@ -164,7 +168,8 @@ def read_series(path: Path) -> RunSeries:
     statistics: list[CycleStatistics] = []
     bus_statistics: list[BusStatistics] = []
     loads = [LOAD_PREFIX + bus.name for bus in reader.run.robot.description.buses]
-    for record in reader.records(("state", "command", "trace", "truth", "event", "health", *loads)):
+    every = ("state", "command", "trace", "truth", "event", "health", *loads)
+    for record in reader.records(every if topics is None else tuple(topics)):
         match record.topic:
             case "state":
                 states.append(decode(RobotState, record.data))
@@ -286,3 +291,9 @@ def _orientations(poses: Sequence[PoseSample | None]) -> Array:
 
 def _seconds(times_ns: list[int]) -> Array:
     return np.array(times_ns, np.float64) * 1e-9
+
+
+def stretches(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last + 1 of each run of rows in which a mask (K,) holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]

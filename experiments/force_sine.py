@@ -29,13 +29,14 @@ import numpy as np
 
 from deploy.errors import UsageError
 from deploy.experiment import Bar, ExperimentRequest, ExperimentResult
-from deploy.series import Array
+from deploy.series import Array, stretches
 from experiments.figures import force_sine_figure, save
 from experiments.hand_runs import end_of, event_of, load, perform, settling_time, workplace
 from experiments.leg_runs import identified_motors
 from experiments.leg_signals import (
     CONFIG,
     Contact,
+    Mask,
     SineSpans,
     best_shift,
     contact,
@@ -208,11 +209,9 @@ def event(scenario: Run, force: Contact, spans: SineSpans) -> dict[str, Any]:
     }
 
 
-def flights(touching: Array, period_s: float) -> int:
+def flights(touching: Mask, period_s: float) -> int:
     """Count the stretches without contact that are longer than `GAP_S`, in (K,) cycles."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([1], touching, [1])).astype(np.int8)))
-    lengths = np.diff(edges.reshape(-1, 2), axis=1)
-    return int(np.count_nonzero(lengths * period_s > GAP_S))
+    return sum((last - first) * period_s > GAP_S for first, last in stretches(~touching))
 
 
 def swing(signal: Array, period_s: float, step_s: float) -> float:

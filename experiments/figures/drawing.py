@@ -16,7 +16,7 @@ from matplotlib.transforms import blended_transform_factory
 from numpy.typing import NDArray
 
 from deploy.plots import STYLE
-from deploy.series import Array, RunSeries
+from deploy.series import Array, RunSeries, stretches
 from schemas.world import HandHeld, Push
 
 AXES: Final = "xyz"
@@ -103,8 +103,7 @@ def name_events(axis: Axes, series: RunSeries) -> None:
 
 def spans(time_s: Array, mask: NDArray[np.bool_]) -> list[tuple[float, float]]:
     """First and last time [s] of each stretch in which a mask (K,) holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
-    return [(float(time_s[first]), float(time_s[end - 1])) for first, end in edges.reshape(-1, 2)]
+    return [(float(time_s[first]), float(time_s[end - 1])) for first, end in stretches(mask)]
 
 
 def shade_mask(axis: Axes, time_s: Array, mask: NDArray[np.bool_], **style: Any) -> None:

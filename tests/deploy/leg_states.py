@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,21 @@ import numpy.typing as npt
 
 from controller_service.base_motion import BaseMotion
 from controller_service.torque_estimation import TorqueEstimator
+from deploy.series import RunSeries, state_series, trace_series, truth_series
 from schemas.base import ControlMode
 from schemas.fingerprint import fingerprint
 from schemas.load import Run, load_run
 from schemas.log import LogWriter
-from schemas.messages import AppliedCommand, DriveState, HalStatus, ImuSample, RobotState, WrenchSample
+from schemas.messages import (
+    AppliedCommand,
+    ControllerTrace,
+    DriveState,
+    Event,
+    HalStatus,
+    ImuSample,
+    RobotState,
+    WrenchSample,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -115,3 +126,26 @@ def write_log(path: Path, states: list[RobotState]) -> Path:
         for each in states:
             log.write("state", each)
     return path
+
+
+def of_states(
+    run: Run,
+    states: list[RobotState],
+    traces: Sequence[ControllerTrace] = (),
+    events: Sequence[Event] = (),
+    *,
+    complete: bool = True,
+) -> RunSeries:
+    """Make a series of states alone, or with traces and events."""
+    description = run.robot.description
+    n = len(description.joints)
+    return RunSeries(
+        run=run,
+        complete=complete,
+        state=state_series(states, n),
+        command_sequence=np.array([], np.int64),
+        trace=trace_series(list(traces), n),
+        truth=truth_series([], n, description.hand_frame),
+        events=tuple(events),
+        statistics=(),
+    )

@@ -14,7 +14,7 @@ from deploy.cli import main
 from deploy.errors import ReportError, UsageError
 from deploy.identify import FitMethod, IdentifyError, IdentifyOptions, fit_joint, fit_pieces, identify
 from deploy.identify_ft import identify_ft
-from deploy.motor_data import LIMIT_SHARE, motor_data, of_states, read_states, together
+from deploy.motor_data import LIMIT_SHARE, motor_data, read_states, together
 from deploy.motor_file import DIGITS, read_payload, rounded, write_motors
 from deploy.series import Array, RunSeries
 from schemas.control_law import SavitzkyGolayFilter
@@ -28,6 +28,7 @@ from tests.deploy.leg_states import (
     leg_motion,
     leg_run,
     leg_states,
+    of_states,
     state,
     write_log,
 )

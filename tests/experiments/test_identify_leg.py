@@ -15,7 +15,6 @@ from deploy.errors import UsageError
 from deploy.experiment import ExperimentRequest
 from deploy.identify import FitMethod, Identification, IdentifyOptions, identify
 from deploy.inprocess import InProcess
-from deploy.motor_data import of_states
 from deploy.series import RunSeries
 from experiments import identify_leg
 from experiments.identify_leg import TrueMotors, qp_newton_difference, table, true_motors
@@ -25,6 +24,7 @@ from schemas.base import Model
 from schemas.load import load_run
 from schemas.messages import RobotState
 from schemas.world import Push
+from tests.deploy.leg_states import of_states
 from tests.experiments.made_up_motors import RUN, made_up_identification
 
 IDEAL: dict[str, Any] = {"plant.dead_zone_scale": 0, "plant.drive_asymmetry": {}, "plant.mass_error": 0}
